@@ -133,7 +133,7 @@ def test_frame_update_keeps_strains(device, rotation):
     )
     q[:, nodes : -spins or None, 0] += random.normal(size=q[:, nodes : -spins or None, 0].shape)
     q[:, -spins:] = 0.3 * rotation * random.normal(size=(2, spins, 3))
-    newton.q.assign(q.reshape(-1, 3))
+    newton.iterates.q.assign(q.reshape(-1, 3))
 
     def energies():
         strains = []
@@ -143,14 +143,14 @@ def test_frame_update_keeps_strains(device, rotation):
                 dtype=coupled.real,
                 device=coupled.device,
             )
-            state.q.assign(newton.q)
+            state.q.assign(newton.iterates.q)
             coupled.strains(state, i, strain)
             strains.append(strain.numpy())
         return np.concatenate([values.ravel() for values in strains])
 
     before, frames = energies(), state.frame.numpy().copy()
     actions = wp.array([UPDATE_FRAMES, 0], dtype=int, device=coupled.device)
-    coupled.renew(state, newton.q, actions)
+    coupled.renew(state, newton.iterates.q, actions)
     after = energies()
     assert np.abs(before).max() > 1.0
     np.testing.assert_allclose(after, before, atol=1e-10 * np.abs(before).max())
@@ -269,7 +269,7 @@ def test_report_states_the_linear_solver_of_a_coupled_system(device, scene):
     model = (scene(True) if scene is whip else scene()).build(device, "float64")
     newton = ddg.Integrator(model)._coupled.newton
     lines = model.report()
-    assert ("exact" in lines) == newton._direct
+    assert ("exact" in lines) == newton.exact
     bands = 3 * 16 * newton.chains.longest * newton.chains.columns if newton.chains else 0
-    assert f"{8 * (newton.matrix.size + bands) / 1e6:.3g} MB" in lines
-    assert f"H: {newton.system.entries} blocks" in lines
+    assert f"{8 * (newton.system.matrix.size + bands) / 1e6:.3g} MB" in lines
+    assert f"H: {newton.sparsity.entries} blocks" in lines

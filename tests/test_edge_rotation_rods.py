@@ -96,7 +96,7 @@ def test_edge_rotation_update_equals_a_walk_along_the_rods(device, anchors, clos
     scene, random = rods(anchors, closed), np.random.default_rng(4)
     model = scene.build(device, "float64", worlds=2)
     newton, host = CoupledNewton(model, NewtonOptions()), model.coupled.host
-    base = newton.base.numpy()
+    base = newton.iterates.base.numpy()
     base[:] = model.state().coupled.q.numpy()
     direction = 0.15 * EDGE * random.normal(size=base.shape)
     fixed = np.tile(host.fixed.all(1), 2)
@@ -104,13 +104,13 @@ def test_edge_rotation_update_equals_a_walk_along_the_rods(device, anchors, clos
     straight[fixed] += EDGE * random.normal(size=(fixed.sum(), 3))
     newton.islands.iterate_action.assign([0, ROTATE_EDGES])
     newton.islands.step_length.fill_(STEP_LENGTH)
-    newton.base.assign(base)
-    newton.direction.assign(direction)
+    newton.iterates.base.assign(base)
+    newton.system.direction.assign(direction)
     results = []
     for _ in range(2):
-        newton.q.assign(straight)
-        newton.turns.place()
-        results.append(newton.q.numpy().reshape(2, -1, 3))
+        newton.iterates.q.assign(straight)
+        newton.turns.place(newton.iterates, newton.system, newton.islands)
+        results.append(newton.iterates.q.numpy().reshape(2, -1, 3))
     inputs = (values.reshape(2, -1, 3)[1] for values in (base, STEP_LENGTH * direction, straight))
     expected = updated(host, *inputs)
     assert np.abs(expected - straight.reshape(results[0].shape)[1]).max() > EDGE

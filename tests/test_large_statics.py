@@ -130,14 +130,14 @@ def test_pressure_follows_and_does_its_work(device):
     q1 = q0 + 0.02 * random.normal(size=q0.shape)
     solver = search.coupled.newton
     solver.begin(q1, tangent.parts[-1].dead_loads(0.7), 0.7, np.ones(1))
-    solver.base.assign(q0.reshape(-1, 3))
+    solver.iterates.base.assign(q0.reshape(-1, 3))
     solver.balance()  # no element is evaluated, so internal forces are zero
     first, second = tangent.loads(0.7, q0), tangent.loads(0.7, q1)
     expected = np.where(tangent.free, second, 0.0)
-    np.testing.assert_allclose(solver.rhs.numpy().ravel(), expected, atol=1e-12 * np.abs(second).max())
+    np.testing.assert_allclose(solver.system.rhs.numpy().ravel(), expected, atol=1e-12 * np.abs(second).max())
     work = 0.5 * (first + second) @ (q1 - q0)
     assert abs(work) > 0.1
-    assert solver.change.numpy().sum() == pytest.approx(-work, rel=1e-12)
+    assert solver.norms.change.numpy().sum() == pytest.approx(-work, rel=1e-12)
 
 
 def test_repeats_bitwise(device):

@@ -109,7 +109,8 @@ def registers() -> list[dict]:
         model = scene(kind, 2, 9).build("cpu", precision)
         integrator = ddg.Integrator(model)
         if model.coupled is not None:
-            terms, kernels = [part.term for part in model.coupled.sets], newton_of(integrator)._evaluate
+            terms = [part.term for part in model.coupled.sets]
+            kernels = [kernel for kernel, _ in newton_of(integrator).elements.kernels]
             reverse = CoupledStepAdjoint(model, "implicit_euler")._vjp
         else:
             (group,) = model.groups

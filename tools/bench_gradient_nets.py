@@ -78,7 +78,10 @@ def from_torch(model, name: str) -> dict:
     system = simulator.engine(model.worlds).adjoint.coupled.solve.system
     times = {"forward": 1e3 * min(forward), "backward": 1e3 * min(backward)}
     times["ratio"] = times["backward"] / times["forward"]
-    return times | {"iterations": int(system.iterations.numpy().max()), "failed": int(system.failed.numpy().sum())}
+    return times | {
+        "iterations": int(system.system.iterations.numpy().max()),
+        "failed": int(system.failed.numpy().sum()),
+    }
 
 
 def by_factors(model) -> dict:

@@ -91,8 +91,8 @@ def equilibria(chosen, device) -> list[dict]:
 def floors(newton) -> dict[str, float]:
     """Return least bytes moved by elements with assembly, and by an iteration of conjugate gradients."""
     coupled, linear = newton.coupled, 4 if newton.linear is wp.float32 else 8
-    blocks, real = newton.all, 8 if newton.real is wp.float64 else 4
-    matrix = 9 * linear * newton.system.entries * newton.worlds
+    blocks, real = len(newton.iterates.q), 8 if newton.coupled.real is wp.float64 else 4
+    matrix = 9 * linear * newton.sparsity.entries * newton.coupled.worlds
     geometry = blocks * 3 * real
     data = sum(4 * elements.slots.size + real * elements.parameters.buffer.size for elements in coupled.sets)
     vectors = blocks * 3 * linear
@@ -146,13 +146,13 @@ def measure(bending: str, cells: int, device, quick: bool, linear: str) -> dict:
         newton.evaluate(coupled)
         newton.assemble()
 
-    newton.forcing.zero_()
+    newton.system.forcing.zero_()
     newton.krylov.rho_first.fill_(1.0)
     parts = {
         "evaluate": clocked(device, lambda: newton.evaluate(coupled), repeats),
         "assembly": clocked(device, assembly, repeats),
         "balance": clocked(device, newton.balance, repeats),
-        "iteration": clocked(device, newton.krylov.cycle, repeats),
+        "iteration": clocked(device, lambda: newton.krylov.cycle(newton.system), repeats),
     }
     floor = floors(newton)
     solves = sum(statistics["outcomes"].values()) - sum(before["outcomes"].values())
@@ -168,7 +168,7 @@ def measure(bending: str, cells: int, device, quick: bool, linear: str) -> dict:
         "newton_mean": statistics["newton_iterations"]["mean"],
         "solves": solves,
         "outcomes": ", ".join(f"{count} {name}" for name, count in statistics["outcomes"].items()),
-        "residual": float(np.sqrt(newton.square.numpy().sum(-1).max())),
+        "residual": float(np.sqrt(newton.norms.square.numpy().sum(-1).max())),
         "build_s": built,
     }
 

@@ -12,6 +12,7 @@ from ddg_warp.errors import SolverError
 from ddg_warp.kernels.adjoint.coupled_linear_solve import chain_rule_kernel
 from ddg_warp.solve.equilibrium.coupled_tangent import CoupledTangent
 from ddg_warp.solve.linear.exact_system import ExactSystem
+from ddg_warp.solve.linear.linear_system import mask
 
 
 class CoupledLinearSolve:
@@ -38,7 +39,8 @@ class CoupledLinearSolve:
         self.held = None
         self._rate = wp.zeros(coupled.worlds, dtype=coupled.real, device=coupled.device)
         self._chain = chain_rule_kernel(coupled.real)
-        self._left_out = self.system and self.system.bits(~coupled.host.fixed | _moved(coupled.host))
+        left_out = mask(~coupled.host.fixed | _moved(coupled.host))
+        self._left_out = wp.array(left_out, dtype=wp.uint8, device=coupled.device)
 
     @cached_property
     def tangent(self) -> CoupledTangent:
@@ -96,7 +98,7 @@ class CoupledLinearSolve:
         wp.launch(
             self._chain,
             len(grad_q),
-            [self.system.fixed, self.coupled.blocks],
+            [self.system.system.masks.fixed, self.coupled.blocks],
             [by_lagged, grad_q],
             device=self.coupled.device,
         )

@@ -1,6 +1,5 @@
 """VJP of the predictor of the coupled system; see `ddg_warp.adjoint.rod_predictor`."""
 
-import copy
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +11,7 @@ from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.newton import coupled_newton
 from ddg_warp.model.coupled_model import CoupledState
 from ddg_warp.solve.linear.sparse_system import lists
+from ddg_warp.solve.newton.coupled_state import Iterates
 from ddg_warp.solve.newton.edge_rotation import EdgeRotations
 
 
@@ -31,9 +31,8 @@ class CoupledPredictor:
         self._islands = Islands(coupled.worlds, real, device)
         self._islands.substep_fraction.fill_(1.0)
         self._dt, self._none = (wp.zeros(coupled.worlds, dtype=real, device=device) for _ in range(2))
-        self._q, self._base, self._target, self.grad_q, self._along = (
-            wp.zeros(coupled.worlds * coupled.blocks, dtype=coupled.vector, device=device) for _ in range(5)
-        )
+        self._iterates = Iterates.of(coupled)
+        self.grad_q, self._along = (wp.zeros_like(self._iterates.q) for _ in range(2))
         self.frame, self._lag = coupled.lagged() if self.carries else (None, None)
         self._begin, _ = coupled_newton.step_kernels(real, midpoint, device_arrays.serial(device))
         self._unplace, self._pass_on, self._turn, self._vjp = coupled_predictor.predictor_kernels(real, midpoint)
@@ -56,7 +55,7 @@ class CoupledPredictor:
         self._excess, self._added, self._by_base, self._by_step = (
             wp.zeros((coupled.worlds, len(nodes)), dtype=coupled.vector, device=device) for _ in range(4)
         )
-        self._solver = self._for = None
+        self._system = self._turns = self._for = None  # of the step's Newton solver, with an own direction
 
     @classmethod
     def of(cls, model, coupled, motion, scheme: str | None) -> "CoupledPredictor | None":
@@ -69,7 +68,7 @@ class CoupledPredictor:
     def kernels(self) -> list:
         """Kernels to load before a capture, after `suit`."""
         kernels_of_predictor = [self._begin, self._unplace, self._pass_on, self._turn, self._vjp, *self.coupled.carries]
-        parts = (self.motion, self._solver.turns)
+        parts = (self.motion, self._turns)
         return kernels_of_predictor + [kernel for part in parts if part for kernel in part.kernels]
 
     def suit(self, step, s: float) -> bool:
@@ -78,28 +77,27 @@ class CoupledPredictor:
             self._for = s, self.model.version
             self._dt.fill_(2.0 * s if self._midpoint else s)
             self._islands.straight_rotation_limit.assign(step.limits(s)["straight_rotation_limit"])
-        if self._solver is not None and self._solver.linear is step.newton.linear:
+        system = step.newton.system
+        if self._system is not None and self._system.direction.dtype is system.direction.dtype:
             return False
-        self._solver = solver = copy.copy(step.newton)  # with arrays of its own
-        solver.q, solver.base, solver.target, solver.islands = self._q, self._base, self._target, self._islands
-        solver.direction = wp.zeros_like(solver.direction)
-        solver.turns = EdgeRotations(solver) if self._levels else None
+        self._system = replace(system, direction=wp.zeros_like(system.direction))
+        self._turns = EdgeRotations(self.coupled, step.newton.linear) if self._levels else None
         return True
 
     def find(self, before: CoupledState) -> None:
         """Compute the predictor of a step from the state `before`; launches only."""
-        coupled, solver, islands = self.coupled, self._solver, self._islands
+        coupled, iterates, islands, fixed = self.coupled, self._iterates, self._islands, self._system.masks.spatial
         islands.iterate_action.zero_()
-        inputs = [before.q, before.v, solver.held, coupled.moves, self._dt, self._none, self._none, *islands.arrays]
-        outputs = [self._q, self._base, self._target]
+        inputs = [before.q, before.v, fixed, coupled.moves, self._dt, self._none, self._none, *islands.arrays]
+        outputs = [iterates.q, iterates.base, iterates.target]
         device_arrays.sweep(
             self._begin, coupled.blocks, [*inputs, coupled.blocks], outputs, coupled.device, worlds=coupled.worlds
         )
         if self.motion:
-            self.motion.place(islands, self._q)
-        if solver.turns:
-            solver.turns.predict(before.v, not self._midpoint)
-        self.state = replace(before, q=self._q)
+            self.motion.place(islands, iterates.q)
+        if self._turns:
+            self._turns.predict(before.v, not self._midpoint, iterates, self._system, islands)
+        self.state = replace(before, q=iterates.q)
         if self.carries:
             self.state = replace(self.state, frame=self.frame, lag=self._lag)
             coupled.carry(before, self.state)
@@ -116,16 +114,16 @@ class CoupledPredictor:
         coupled, islands, worlds = self.coupled, self._islands, self.coupled.worlds
         for array in (self._along, self._excess, self._added, self._by_base, self._by_step):
             array.zero_()
-        inputs = [*self._rods, self._solver.held, islands.iterate_action, coupled.blocks, self.grad_q]
+        inputs = [*self._rods, self._system.masks.spatial, islands.iterate_action, coupled.blocks, self.grad_q]
         for rods, meets, starts, items in self._levels:
             self._launch(self._unplace, (len(rods), worlds), [rods, *inputs], [self._excess, self._added])
             read = [meets, starts, items, coupled.blocks, self._added]
             self._launch(self._pass_on, (len(meets), worlds), read, [self.grad_q, self._along])
-        held_mass = [self._solver.held, self.coupled.moves]
+        held_mass = [self._system.masks.spatial, self.coupled.moves]
         read = [
             self._nodes,
             self._ahead,
-            self._q,
+            self._iterates.q,
             before.q,
             before.v,
             *held_mass,
@@ -136,7 +134,7 @@ class CoupledPredictor:
         self._launch(self._turn, (len(self._nodes), worlds), read, [self._by_base, self._by_step])
         read = [self.grad_q, self._along, self._placed, *self._meets, len(self._nodes), self._by_base, self._by_step]
         read += [before.v, *held_mass, islands.iterate_action, islands.inverse_step, coupled.blocks]
-        self._launch(self._vjp, len(self._q), read, [by_fixed, start.q, start.v, grad_inverse_step])
+        self._launch(self._vjp, len(self._iterates.q), read, [by_fixed, start.q, start.v, grad_inverse_step])
 
     def _put(self, values: np.ndarray) -> wp.array:
         return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=self.coupled.device)

@@ -172,7 +172,7 @@ class CoupledStepAdjoint:
 
     def keep(self, step, before: CoupledState) -> CoupledSavedStep:
         """Return the saved data of the last step of a `CoupledStep`; `before` must stay unchanged."""
-        coupled, q = self.coupled, wp.clone(step.newton.q)
+        coupled, q = self.coupled, wp.clone(step.newton.iterates.q)
         data = {index: wp.clone(values) for index, values in step._data.items()}
         solved = replace(before, q=q, data=data)
         if coupled.edges:

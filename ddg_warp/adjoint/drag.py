@@ -141,8 +141,7 @@ class CoupledDragAdjoint:
     def resist(self, before, tangents: wp.array, rate: float) -> None:
         """Write `inertia` of a solve from the state `before`, with the tangents of that solve."""
         self._islands.inverse_step.fill_(rate)
-        target = SimpleNamespace(q=tangents, outer=self.coupled.still, mass=self.inertia)
-        self.drag.resist(before, target, self._islands)
+        self.drag.resist(before, tangents, self.inertia, self.coupled.still, self._islands)
 
     @property
     def matrix(self) -> sparse.csc_matrix:

@@ -45,13 +45,12 @@ def test_whole_step_completes_the_prescribed_motion(device, monkeypatch):
     model = scene.build(device=device, precision="mixed")
     records, hold, place = [], NewtonContact.hold, NewtonContact.place
 
-    def record(contact):
-        islands = contact.newton.islands
+    def record(contact, islands):
         arrays = (contact.search.time, islands.step_length, islands.support_motion_pending)
         records.append([float(values.numpy()[0]) for values in arrays])
 
     def watched(method):
-        return lambda contact: (method(contact), record(contact))
+        return lambda contact, *state: (method(contact, *state), record(contact, state[-1]))
 
     monkeypatch.setattr(NewtonContact, "place", watched(place))
     monkeypatch.setattr(NewtonContact, "hold", watched(hold))

@@ -12,7 +12,8 @@ from ddg_warp.kernels.core.islands import BELOW_ROUNDING_FLOOR, NOT_CONVERGED, S
 from ddg_warp.kernels.newton.relaxed_convergence import FARTHEST
 from ddg_warp.run.simulate import simulate
 from ddg_warp.solve.linear.pcg import SPARE
-from ddg_warp.solve.newton.coupled_newton import LOOSEST, CoupledNewton
+from ddg_warp.solve.newton.coupled_newton import CoupledNewton
+from ddg_warp.solve.newton.line_search import LOOSEST
 
 RADIUS, DT, RTOL = 2e-3, 1 / 240, 1e-4
 SOFT = ddg.Material(young=1e6, density=1000.0, poisson=0.5)
@@ -43,8 +44,8 @@ def step_residuals(device, outliers: float, worlds: int = 1):
     integrator = ddg.Integrator(model, rtol=RTOL, unconverged_fraction=outliers, check_every=1)
     state = integrator.step(model.state(velocities=velocities), DT)
     newton = integrator._coupled.newton
-    ratio, owner = newton.allowed.ratio.numpy(), newton.resting.owner.numpy()
-    worst = np.zeros((worlds, newton.resting.bodies))
+    ratio, owner = newton.tolerances.ratio.numpy(), newton.sleeping.owner.numpy()
+    worst = np.zeros((worlds, newton.sleeping.bodies))
     for body_worst, block_ratio in zip(worst, ratio, strict=True):
         np.maximum.at(body_worst, owner[owner >= 0], block_ratio[owner >= 0])
     worst /= RTOL * newton.islands.load_scale.numpy()[:, None]
@@ -75,10 +76,10 @@ def test_linear_solves_leave_few_bodies_unconverged(device, monkeypatch):
         take(newton)
         if newton is integrator._coupled.newton and not newton.islands.ccd_limited.numpy()[0]:
             newton.islands.needs_direction.fill_(2)
-            newton.krylov.compare()
-            newton.unconverged_fraction.count(SPARE * tolerance)
-            reduced, limit = float(newton.forcing.numpy()[0]), float(newton.limit.numpy()[0])
-            records.append((int(newton.unconverged_fraction.number.numpy()[0]), reduced, limit))
+            newton.krylov.compare(newton.system, newton.islands)
+            newton.relaxed.count(SPARE * tolerance, newton.tolerances.ratio, newton.islands)
+            reduced, limit = float(newton.system.forcing.numpy()[0]), float(newton.system.limit.numpy()[0])
+            records.append((int(newton.relaxed.number.numpy()[0]), reduced, limit))
 
     monkeypatch.setattr(CoupledNewton, "take", record)
     step_without_capture(integrator, model.state(velocities=velocities), DT)
@@ -131,20 +132,20 @@ def test_outliers_are_accepted_by_number_and_residual(device, case):
     scene, _ = crossed_pairs(10)
     model = scene.build(device=device, precision="float64")
     newton = ddg.Integrator(model, rtol=RTOL, unconverged_fraction=0.1)._coupled.newton
-    owner, islands, scale = newton.resting.owner.numpy().copy(), newton.islands, 3.0
+    owner, islands, scale = newton.sleeping.owner.numpy().copy(), newton.islands, 3.0
     if bodies == (-1,):
         owner[7] = -1
-        newton.unconverged_fraction._owner.assign(owner)
+        newton.relaxed._owner.assign(owner)
     ratio = np.where(np.isin(owner, bodies), off, 0.5) * RTOL * scale
-    newton.allowed.ratio.assign(ratio[None])
-    newton.worst.fill_(ratio.max())
-    newton._weight.assign(np.array([[0.0], [0.0], [1.0 if finite else np.nan]]))
+    newton.tolerances.ratio.assign(ratio[None])
+    newton.norms.worst.fill_(ratio.max())
+    newton.norms.of_worlds.assign(np.array([[0.0], [0.0], [1.0 if finite else np.nan]]))
     islands.load_scale.fill_(scale)
     flags = islands.arrays[0].numpy()
     flags[[STATUS, NOT_CONVERGED, BELOW_ROUNDING_FLOOR]] = [[0], [1], [1]]
     islands.arrays[0].assign(flags)
-    newton.unconverged_fraction.count(RTOL)
-    newton.unconverged_fraction.excuse()
+    newton.relaxed.count(RTOL, newton.tolerances.ratio, islands)
+    newton.relaxed.excuse(RTOL, newton.norms, islands)
     wp.synchronize()
     assert (islands.arrays[0].numpy()[[NOT_CONVERGED, BELOW_ROUNDING_FLOOR]] == (0 if excused else 1)).all()
 

@@ -68,9 +68,9 @@ def record_directions(device, scene, velocities, worlds: int = 1, linear="chain"
     direct = newton.direct
 
     def record():
-        before = newton.q.numpy().reshape(worlds, -1, 3)[:, :nodes]
+        before = newton.iterates.q.numpy().reshape(worlds, -1, 3)[:, :nodes]
         direct()
-        records.append((newton.direction.numpy().reshape(worlds, -1, 3)[:, :nodes].astype(float), before))
+        records.append((newton.system.direction.numpy().reshape(worlds, -1, 3)[:, :nodes].astype(float), before))
 
     newton.direct = record
     end = step_without_capture(integrator, state, DT)
@@ -158,8 +158,9 @@ def test_islands_are_connected_components_of_the_pairs(device):
     integrator.step(state, 1e-4)
     newton = integrator._coupled.newton
     newton.islands.needs_direction.fill_(1)
-    newton.resting(newton.contact.terms.products)
-    link = newton.resting._link.numpy()
+    groups = newton.search_state, newton.system, newton.islands
+    newton.sleeping(newton.contact.terms.products, newton.tolerances.ratio, newton.options.rtol, *groups)
+    link = newton.sleeping._link.numpy()
     nodes = np.concatenate(
         [
             pair_list.factor.nodes.numpy()[: int(pair_list.count.numpy()[0])].reshape(-1, 4)

@@ -120,9 +120,9 @@ class Problem:
         q[:] = q * stretch + noise * random.normal(size=q.shape) * free
         self.state.coupled.q.assign(q)
         newton = self.newton = CoupledNewton(self.model, NewtonOptions(psd=psd), preconditioner)
-        wp.copy(newton.q, self.state.coupled.q)
-        wp.copy(newton.base, self.state.coupled.q)
-        newton.target.assign(q + 5.0 * noise * random.normal(size=q.shape) * free)
+        wp.copy(newton.iterates.q, self.state.coupled.q)
+        wp.copy(newton.iterates.base, self.state.coupled.q)
+        newton.iterates.target.assign(q + 5.0 * noise * random.normal(size=q.shape) * free)
         newton.islands.inertia_coefficient.assign([30.0, 50.0])
         newton.islands.inverse_step.fill_(1.0)
         newton.islands.needs_direction.fill_(1)
@@ -133,12 +133,12 @@ class Problem:
         newton.balance()
         newton.assemble()
         if newton.chains and newton.chains.exact:  # direct substructuring assembles during the solve
-            newton.chains.assemble(newton.matrix, newton.mass, newton.islands)
+            newton.chains.assemble(newton.system.matrix, newton.loading.mass, newton.islands)
         return self
 
     def iterate(self, forcing: float):
         newton = self.assemble().newton
-        newton.forcing.fill_(forcing)
+        newton.system.forcing.fill_(forcing)
         newton.direct()
         return self
 
@@ -147,9 +147,9 @@ class Problem:
 
         Bands must not have been factorised.
         """
-        table, N = self.newton.system, self.blocks
+        table, N = self.newton.sparsity, self.blocks
         rows, columns = table.rows.numpy(), table.columns.numpy()
-        values = self.newton.matrix.numpy().reshape(9, 2, -1)[:, world].copy()
+        values = self.newton.system.matrix.numpy().reshape(9, 2, -1)[:, world].copy()
         padding = rows < 0
         assert not values[:, padding].any()
         if self.newton.chains and self.newton.chains.exact:

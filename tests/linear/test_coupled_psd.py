@@ -72,9 +72,9 @@ def deflected_cut_helix(device, psd: str):
     s = np.concatenate([s[:7], s[7:]])
     target[: host.nodes] += 0.2 * s[:, None] ** 2 * np.array([1.0, 0.5, 0.7])
     target[host.nodes : host.nodes + host.angles, 0] += s[: host.angles]
-    for array in (newton.q, newton.base):
+    for array in (newton.iterates.q, newton.iterates.base):
         array.assign(q)
-    newton.target.assign(target)
+    newton.iterates.target.assign(target)
     newton.islands.inertia_coefficient.fill_(500.0)
     newton.islands.any_active.fill_(1)
     return newton, state.coupled
@@ -144,4 +144,4 @@ def test_default_mode_follows_natural_curvature(device):
     for scene, expected in cases:
         assert CoupledNewton(scene.build(device, "float64"), NewtonOptions()).psd == expected
     newton = CoupledNewton(sheet("hinge").build(device, "float64"), NewtonOptions(psd="progressive"))
-    assert set(newton.exact_from) == {None}
+    assert set(newton.elements.exact_from) == {None}

@@ -43,7 +43,7 @@ def first_direction(
     state, islands = model.state().coupled, newton.islands
     q = state.q.numpy()
     free = np.tile(~model.coupled.host.fixed, (2, 1))
-    for array, size in ((newton.q, noise), (newton.base, noise), (newton.target, 1e-3)):
+    for array, size in ((newton.iterates.q, noise), (newton.iterates.base, noise), (newton.iterates.target, 1e-3)):
         array.assign(q + size * random.normal(size=q.shape) * free)
     islands.inertia_coefficient.fill_(100.0)
     islands.inverse_step.fill_(10.0)
@@ -55,8 +55,8 @@ def first_direction(
     newton.assemble()
     newton.direct()
     assert newton.chains.splits
-    assert (newton.negative.numpy() == 0).all()
-    return newton, newton.direction.numpy().astype(float).reshape(2, -1, 3)
+    assert (newton.system.indefinite.numpy() == 0).all()
+    return newton, newton.system.direction.numpy().astype(float).reshape(2, -1, 3)
 
 
 @pytest.mark.parametrize("twist", [True, False])
@@ -69,7 +69,7 @@ def test_directions_match_full_matrix(device, twist):
         np.testing.assert_allclose(mixed, exact, rtol=0, atol=1e-9 * np.abs(exact).max())
         element_set = next(element_set for element_set in newton.coupled.sets if element_set.term.measure.tensions)
         a, b = element_set.host.slots[:2]
-        q = newton.q.numpy().reshape(2, -1, 3)
+        q = newton.iterates.q.numpy().reshape(2, -1, 3)
         edges, steps = q[:, b] - q[:, a], mixed[:, b] - mixed[:, a]
         along = np.sum(edges * steps, axis=-1) / np.linalg.norm(edges, axis=-1)
         element = newton.chains.plan.elements(newton.coupled.host, element_set.host)[1]

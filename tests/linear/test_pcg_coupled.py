@@ -42,8 +42,8 @@ def test_directions_match_dense_solve(device, bending, precision):
     problem.iterate(1e-7 if precision == "mixed" else 1e-13)
     free, size = problem.free(), 3 * problem.blocks
     tolerance = 2e-4 if precision == "mixed" else 1e-9
-    rhs = problem.newton.rhs.numpy().astype(float).reshape(2, size)
-    direction = problem.newton.direction.numpy().astype(float).reshape(2, size)
+    rhs = problem.newton.system.rhs.numpy().astype(float).reshape(2, size)
+    direction = problem.newton.system.direction.numpy().astype(float).reshape(2, size)
     for world in range(2):
         H = problem.matrix(world).astype(float)
         assert np.abs(H - H.T).max() <= (1e-6 if precision == "mixed" else 1e-14) * np.abs(H).max()
@@ -56,13 +56,13 @@ def test_directions_match_dense_solve(device, bending, precision):
 def test_residual_matches_tangent(device):
     problem = Problem(frame_and_sheet(), device, 1.02).iterate(0.1)
     tangent, newton, host = Tangent(problem.model), problem.newton, problem.coupled.host
-    q = newton.q.numpy()
+    q = newton.iterates.q.numpy()
     inertia = (
         np.tile(host.mass, (2, 1)) * np.repeat(newton.islands.inertia_coefficient.numpy(), problem.blocks)[:, None]
     )
     force = tangent.loads(1.0, q.ravel()) - tangent.gradient(problem.state)
-    expected = np.where(tangent.free, force - (inertia * (q - newton.target.numpy())).ravel(), 0.0)
-    residual = newton.rhs.numpy().ravel()
+    expected = np.where(tangent.free, force - (inertia * (q - newton.iterates.target.numpy())).ravel(), 0.0)
+    residual = newton.system.rhs.numpy().ravel()
     np.testing.assert_allclose(residual, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
 
 
@@ -75,7 +75,7 @@ def test_product_matches_matrix(device):
     newton.krylov.p.assign(vector)
     newton.islands.needs_direction.fill_(1)
     newton.krylov.rho.fill_(1.0)
-    newton.krylov.cycle()
+    newton.krylov.cycle(newton.system)
     product = newton.krylov.product.numpy().reshape(2, size)
     for world in range(2):
         expected = np.where(free, problem.matrix(world) @ vector.reshape(2, size)[world], 0.0)
@@ -89,8 +89,8 @@ def test_negative_curvature_stops_pcg_and_projects(device, preconditioner):
     problem.newton.islands.inertia_coefficient.fill_(1e-3)
     newton = problem.iterate(1e-10).newton
     assert newton.islands.drop_compression.numpy().tolist() == [1, 1]
-    assert newton.iterations.numpy().max() < 10
-    rhs, direction = (array.numpy().reshape(2, -1) for array in (newton.rhs, newton.direction))
+    assert newton.system.iterations.numpy().max() < 10
+    rhs, direction = (array.numpy().reshape(2, -1) for array in (newton.system.rhs, newton.system.direction))
     assert ((rhs * direction).sum(1) > 0.0).all()
     assert np.isfinite(direction).all()
 
@@ -129,10 +129,10 @@ def test_level_blocks_are_galerkin_products(device):
     integrator.step(model.state(), 0.01)
     newton = integrator._coupled.newton
     newton.islands.needs_direction.fill_(1)
-    newton.krylov.levels.prepare(newton.matrix, newton.fixed, newton.islands.needs_direction)
-    table, blocks = newton.system, model.coupled.blocks
+    newton.krylov.levels.prepare(newton.system.matrix, newton.system.masks.fixed, newton.islands.needs_direction)
+    table, blocks = newton.sparsity, model.coupled.blocks
     H = np.zeros((3 * blocks, 3 * blocks))
-    rows, columns, values = table.rows.numpy(), table.columns.numpy(), newton.matrix.numpy()
+    rows, columns, values = table.rows.numpy(), table.columns.numpy(), newton.system.matrix.numpy()
     for p in np.flatnonzero(rows >= 0):
         H[3 * rows[p] : 3 * rows[p] + 3, 3 * columns[p] : 3 * columns[p] + 3] = values[:, p].reshape(3, 3)
     free = ~model.coupled.host.fixed.ravel()

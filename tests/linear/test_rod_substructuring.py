@@ -36,9 +36,9 @@ def apply_preconditioner(problem: Problem, vectors: np.ndarray) -> np.ndarray:
         r = vector.reshape(-1, 3)
         newton.krylov.rest.assign(r)
         newton.krylov.z.assign(np.einsum("bij,bj->bi", inverse, r))
-        newton.krylov.precondition(newton.krylov.z)
+        newton.krylov.precondition(newton.system, newton.krylov.z)
         results.append(newton.krylov.z.numpy().astype(float).reshape(vector.shape))
-        dots = newton.krylov_dots.numpy().reshape(-1)
+        dots = newton.system.dots.numpy().reshape(-1)
         np.testing.assert_allclose(
             dots, (r * newton.krylov.z.numpy()).sum(1), rtol=1e-4, atol=1e-6 * np.abs(dots).max()
         )
@@ -48,7 +48,7 @@ def apply_preconditioner(problem: Problem, vectors: np.ndarray) -> np.ndarray:
 def pcg_iterations(problem: Problem, forcing: float) -> np.ndarray:
     """Return the PCG iterations of each world to the relative residual `forcing`, with a projected matrix."""
     problem.newton.islands.drop_compression.fill_(1)
-    return problem.iterate(forcing).newton.iterations.numpy()
+    return problem.iterate(forcing).newton.system.iterations.numpy()
 
 
 def dense_preconditioner(problem: Problem, world: int) -> np.ndarray:
@@ -189,7 +189,7 @@ def test_systems_with_at_most_one_joint_need_no_pcg(device, scene, precision):
     matrices, newton, free = [problem.assemble().matrix(world) for world in range(2)], problem.newton, problem.free()
     newton.direct()
     assert newton.chains.exact and newton.pcg_iterations() == 0
-    rhs, direction = (v.numpy().astype(float).reshape(2, -1) for v in (newton.rhs, newton.direction))
+    rhs, direction = (v.numpy().astype(float).reshape(2, -1) for v in (newton.system.rhs, newton.system.direction))
     for world in range(2):
         expected = np.zeros(free.size)
         expected[free] = np.linalg.solve(matrices[world][np.ix_(free, free)], rhs[world][free])
@@ -211,7 +211,7 @@ def test_elimination_detects_indefinite_matrices(device, scene):
     islands.needs_direction.fill_(1)
     problem.iterate(0.1)
     assert islands.needs_direction.numpy().tolist() == [1, 1]
-    assert (problem.newton.rhs.numpy() * problem.newton.direction.numpy()).sum() > 0.0
+    assert (problem.newton.system.rhs.numpy() * problem.newton.system.direction.numpy()).sum() > 0.0
 
 
 @pytest.mark.parametrize("rigid", [True, False])
@@ -336,19 +336,26 @@ def test_assembly_along_rods_matches_incidence_lists(device, scene, psd):
         problem = Problem(scene(), device, 1.02, preconditioner=preconditioner, psd=psd)
         newton, islands = problem.newton, problem.newton.islands
         random = np.random.default_rng(5)
-        newton.base.assign(newton.q.numpy() + 0.01 * random.normal(size=(newton.all, 3)))
+        newton.iterates.base.assign(newton.iterates.q.numpy() + 0.01 * random.normal(size=(len(newton.iterates.q), 3)))
         islands.load_scale.fill_(1.0)
         islands.iteration.fill_(3)  # late enough for second derivatives
-        for element_set in newton.parts:
+        for element_set in newton.elements.outputs:
             element_set["energy"].fill_(0.25)  # of the accepted iterate
         problem.assemble()
         free = problem.free()
-        vectors = (newton.rhs, newton.allowed.least, newton.allowed.ratio, newton.square, newton.change, newton.noise)
+        vectors = (
+            newton.system.rhs,
+            newton.tolerances.least,
+            newton.tolerances.ratio,
+            newton.norms.square,
+            newton.norms.change,
+            newton.norms.noise,
+        )
         results.append([*(v.numpy().astype(float) for v in vectors)])
         results[-1] += [problem.matrix(world)[np.ix_(free, free)] for world in range(2)]
         flags = islands.not_converged.numpy().tolist(), islands.below_rounding_floor.numpy().tolist()
         assert flags == ([1, 1], [1, 1])
-    assert problem.newton.chains.banded and any(problem.newton.local)
+    assert problem.newton.chains.banded and any(problem.newton.elements.local)
     for by_lists, by_dof_map in zip(*results, strict=True):
         assert np.abs(by_lists).max() > 0.0
         np.testing.assert_allclose(by_dof_map, by_lists, rtol=1e-11, atol=1e-12 * np.abs(by_lists).max())

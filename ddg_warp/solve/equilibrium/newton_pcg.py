@@ -58,15 +58,15 @@ class StaticNewton(CoupledNewton):
     def __init__(self, model, options: NewtonOptions):
         super().__init__(model, options, coupled_preconditioner(model.coupled), model.types.real)
         self._whole = False  # True if directions are not cut at FAR step caps
-        self.gravity.zero_()  # gravity is a load like others: `begin` scales all
+        self.loading.gravity.zero_()  # gravity is a load like others: `begin` scales all
         self.loads = StaticLoads(model, self.coupled, midpoint=False) if self.coupled.host.followers else None
-        self._there, self._before = wp.zeros_like(self.load), wp.zeros_like(self.q)
+        self._base_force, self._before = wp.zeros_like(self.loading.force), wp.zeros_like(self.iterates.q)
         self.islands.substep_accepted.fill_(1)
-        self._follow, self._less, self._far = coupled_newton.static_kernels(self.real, self.linear)
+        self._follow, self._less, self._far = coupled_newton.static_kernels(self.coupled.real, self.linear)
         self.has_friction = self.contact is not None and self.contact.has_friction
         if self.has_friction:  # not the rate of strain-rate damping, which acts at rest
             self.contact.rate = wp.zeros_like(self.islands.inverse_step)
-            self.slid = wp.zeros_like(self.q)
+            self.slid = wp.zeros_like(self.iterates.q)
 
     @property
     def kernels(self) -> list:
@@ -98,42 +98,38 @@ class StaticNewton(CoupledNewton):
             "frames_outdated",
         ):
             getattr(self.islands, name).zero_()
-        self.q.assign(q.reshape(-1, 3))
-        self.base.assign((q if before is None else before).reshape(-1, 3))
+        self.iterates.q.assign(q.reshape(-1, 3))
+        self.iterates.base.assign((q if before is None else before).reshape(-1, 3))
         if self.contact:
-            wp.copy(self._before, self.base)
-            self.contact.rest()
+            wp.copy(self._before, self.iterates.base)
+            self.contact.rest(self.iterates, self.islands)
         if self.has_friction:
             self.contact.rate.fill_(rate)
             if slid is not None:
                 self.slid.assign(slid)
-        for load in (self.load, self._there):
-            load.assign(dead.reshape(-1, 3))
+        for force in (self.loading.force, self._base_force):
+            force.assign(dead.reshape(-1, 3))
         if self.loads:
-            self.loads.scale(dead.reshape(self.worlds, -1, 3), load_factor)
-        wp.copy(self.islands.load_scale, self.allowed.assign(scale.reshape(self.worlds, -1)))
+            self.loads.scale(dead.reshape(self.coupled.worlds, -1, 3), load_factor)
+        wp.copy(self.islands.load_scale, self.tolerances.assign(scale.reshape(self.coupled.worlds, -1)))
         self.islands.any_active.fill_(1)
 
     def balance(self) -> None:
         """Assemble residuals under the loads on the iterate, which do their mean work along a step."""
+        iterates, force, coupled = self.iterates, self.loading.force, self.coupled
         if self.loads:
-            for q, load in ((self.here, self.load), (self.base, self._there)):
-                self.loads.apply(self.coupled.points(q), self.coupled.points(load), self.coupled.angles(load))
+            for q, load in ((iterates.proposed, force), (iterates.base, self._base_force)):
+                self.loads.apply(coupled.points(q), coupled.points(load), coupled.angles(load))
         super().balance()
         if self.loads:
-            wp.launch(
-                self._follow,
-                self.all,
-                [self.here, self.base, self.load, self._there, self.islands.status, self.coupled.blocks],
-                [self.change],
-                device=self.device,
-            )
+            inputs = [iterates.proposed, iterates.base, force, self._base_force, self.islands.status, coupled.blocks]
+            wp.launch(self._follow, len(force), inputs, [self.norms.change], device=coupled.device)
 
     def search(self, state, again: bool = False) -> None:
         """Solve from the start of `begin`, with the lagged data of `state`. With `again`, slips continue. Can be captured."""
         if self.contact:
             self.contact.renew(self._before)
-            self.contact.place()
+            self.contact.place(self.iterates, self.system, self.islands)
             self.contact.lag(self._before, again)
             if self.has_friction:
                 wp.copy(self.contact.terms.start, self.slid)
@@ -146,7 +142,7 @@ class StaticNewton(CoupledNewton):
         """
         return self.contact is not None and self.contact.has_overflow(self._before, spare=True)
 
-    def watch(self) -> None:
+    def after_cycle(self) -> None:
         """Stop PCG where the direction exceeds `FAR` step caps, since directions grow with every iteration.
 
         (Steihaug, SIAM J. Numer. Anal. 20, 1983.) Otherwise the first direction of a flat sheet, against bending alone, costs the
@@ -154,31 +150,27 @@ class StaticNewton(CoupledNewton):
         """
         if self._whole:
             return
-        self.measure_turns()
+        self.measure_rotation()
         if self.planes:
-            self.planes.into(self.direction, self.islands.needs_direction)
-        wp.launch(
-            self._far,
-            self.worlds,
-            [self.turn, FAR * self.options.rotation_cap],
-            [self.islands.needs_direction],
-            device=self.device,
-        )
+            self.planes.into(self.system.direction, self.system.wanted)
+        inputs = [self.search_state.rotation, FAR * self.options.rotation_cap]
+        wp.launch(self._far, self.coupled.worlds, inputs, [self.system.wanted], device=self.coupled.device)
 
     def follow(self, state, step: wp.array) -> None:
         """Compute the direction of free dofs for a `step` of fixed dofs, H d = r - H step, in worlds that need it."""
-        if self.resting:
-            self.resting.wake()
+        if self.sleeping:
+            self.sleeping.wake(self.search_state, self.system, self.islands)
         if self.contact:
             self.contact.see(self._before)
             self.contact.lag(self._before)
         self.evaluate(state)
         self.balance()
-        if self.resting:
-            self.resting.leave(self.contact.terms.products)
+        if self.sleeping:
+            self.sleeping.leave(self.contact.terms.products, self.system)
         self.assemble()
-        self.krylov.multiply_matrix(step)
-        wp.launch(self._less, self.all, [self.krylov.product], [self.rhs], device=self.device)
+        self.krylov.multiply_matrix(self.system, step)
+        rhs = self.system.rhs
+        wp.launch(self._less, len(rhs), [self.krylov.product], [rhs], device=self.coupled.device)
         self._whole = True
         self.direct()
         self._whole = False
@@ -237,7 +229,7 @@ class CoupledEquilibrium:
         self._rest = self.tangent.dofs(model.state())
         self._size = float(np.ptp(model.coupled.host.rest[: model.coupled.host.nodes], axis=0).max())
         self._start = model.coupled.empty()  # lagged data of a solve
-        self._step = wp.zeros(self.newton.all, dtype=self.newton.rhs.dtype, device=model.wp_device)
+        self._step = wp.zeros_like(self.newton.system.rhs)
         self._graphs = Graphs(model, lambda: device_arrays.load_kernels(self.newton.kernels, model.wp_device))
         self.wary = True
         self.polish = None
@@ -278,13 +270,14 @@ class CoupledEquilibrium:
 
         def begin():
             self._begin(state, load_factor)
-            self.newton.islands.needs_direction.fill_(1)
-            self.newton.forcing.fill_(FORCING)
-            self.newton.goal.fill_(math.inf)
+            system = self.newton.system
+            system.wanted.fill_(1)
+            system.forcing.fill_(FORCING)
+            system.goal.fill_(math.inf)
 
         self._step.assign(step.reshape(-1, 3))
         self._replay("follow", begin, lambda: self.newton.follow(self._start, self._step))
-        direction = self.newton.direction.numpy().astype(np.float64).ravel()
+        direction = self.newton.system.direction.numpy().astype(np.float64).ravel()
         return direction if np.isfinite(direction).all() else None
 
     def solve(self, state: State, load_factor: float, before: State, increment: float) -> State:
@@ -361,7 +354,7 @@ class CoupledEquilibrium:
             before, iterations, ends = state, self.newton.islands.iteration.numpy(), self.newton.islands.status.numpy()
             owner.iterations += int(iterations.sum())
             begun = state.coupled.q.numpy().copy()
-            wp.copy(state.coupled.q, self.newton.q)
+            wp.copy(state.coupled.q, self.newton.iterates.q)
             near = on and self.arrived and self._near(begun, state)
             if on:
                 self._relax(relaxation, state, begun)

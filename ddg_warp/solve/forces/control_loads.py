@@ -155,13 +155,13 @@ class CoupledScale(_Scale):
     """Residual limits of dof blocks and clusters of the coupled system; see `compile.residual_tolerance`.
 
     Args:
-        solver: the `CoupledNewton` whose `allowed` and `outer` are written.
+        solver: the `CoupledNewton` whose tolerances and load scale are written.
     """
 
     def __init__(self, model, part, solver):
         bodies = part.host.bodies
         super().__init__(model, part.worlds, bodies.owner, bodies.count)
-        real, self._scale = model.types.real, solver.outer
+        real, self._scale = model.types.real, solver.loading.scale
         self._share, self._limit = kernels.scale_kernel(real), kernels.limit_kernel(real)
         self.kernels += [self._share, self._limit]
         order = np.argsort(bodies.components, kind="stable")
@@ -171,9 +171,9 @@ class CoupledScale(_Scale):
         block, body, weight = bodies.limit_entries()
         order = np.argsort(block, kind="stable")
         starts = np.searchsorted(block[order], np.arange(part.blocks + 1))
-        limits = solver.allowed.blocks.reshape((part.worlds, part.blocks))
+        limits = solver.tolerances.blocks.reshape((part.worlds, part.blocks))
         self._limits = [self._list(starts, body[order], weight[order], limits)]
-        for level, limit in zip(bodies.levels, solver.allowed.limits, strict=True):
+        for level, limit in zip(bodies.levels, solver.tolerances.limits, strict=True):
             self._limits.append(self._list(np.arange(len(level.body) + 1), level.body, level.weight, limit))
         self.keep(self._scale, *(limit for *_, limit in self._limits))
 

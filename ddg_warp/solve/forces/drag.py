@@ -114,16 +114,16 @@ class CoupledDrag(Drag):
             wp.array(np.ascontiguousarray(v, np.int32), dtype=int, device=device) for v in (ends.T, starts, items // 3)
         )
 
-    def resist(self, before, solver, islands) -> None:
-        """Write inertia and drag of a solve from the state `before`, after the predictor."""
+    def resist(self, before, q: wp.array, mass: wp.array, load_scale: wp.array, islands) -> None:
+        """Write inertia and drag `mass` of a solve from the state `before`, given the predictor q."""
         coupled = self.part
         self._launch(
             self._resist,
             coupled.worlds * coupled.blocks,
-            [before.q, before.v, solver.q if self.midpoint else before.q, solver.q, coupled.mass, self.ends]
-            + [coupled.drag, self.starts, self.items, self.flow, solver.outer, *islands.arrays]
+            [before.q, before.v, q if self.midpoint else before.q, q, coupled.mass, self.ends]
+            + [coupled.drag, self.starts, self.items, self.flow, load_scale, *islands.arrays]
             + [coupled.blocks, coupled.host.nodes],
-            [solver.mass],
+            [mass],
         )
 
     def at(self, state, t: float) -> tuple[np.ndarray, np.ndarray]:
@@ -131,7 +131,7 @@ class CoupledDrag(Drag):
         coupled, device = self.part, self.model.wp_device
         mass = wp.zeros((coupled.worlds, coupled.blocks), dtype=drag.block_inertia(coupled.real), device=device)
         self.upload(t, t)
-        self.resist(state, SimpleNamespace(q=state.q, outer=coupled.still, mass=mass), self._over_a_second())
+        self.resist(state, state.q, mass, coupled.still, self._over_a_second())
         flow = np.zeros((coupled.blocks, 3))
         flow[: coupled.host.nodes] = self.flow.numpy()[0]
         return mass.numpy(), flow
@@ -142,9 +142,9 @@ class CoupledDrag(Drag):
         v, a = (array.numpy().astype(float).reshape(coupled.worlds, -1, 3) for array in (state.v, state.a))
         return v + lead * np.where((coupled.mass.numpy() <= 0.0) & (v != 0.0), a, 0.0) if lead > 0.0 else v
 
-    def settle(self, before, after, solver, islands) -> None:
+    def settle(self, before, after, q: wp.array, mass: wp.array, islands) -> None:
         """Write the rates of massless dofs of the state `after`, which may be `before` itself."""
         coupled = self.part
         if self.midpoint:
-            inputs = [solver.q, solver.mass, *islands.arrays, coupled.blocks, after.q, before.v]
+            inputs = [q, mass, *islands.arrays, coupled.blocks, after.q, before.v]
             self._launch(self._settle, coupled.worlds * coupled.blocks, inputs, [after.v, after.a])

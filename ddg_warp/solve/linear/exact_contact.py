@@ -3,7 +3,7 @@
 import warp as wp
 
 from ddg_warp.solve.collision.contact_model import ContactModel
-from ddg_warp.solve.linear.contact_bands import ContactBands
+from ddg_warp.solve.linear.contact_hessian import ContactHessian
 
 MARGIN = 1e-3  # of the search distance: skin margin; the query is a single position
 
@@ -13,7 +13,7 @@ class ExactContact:
 
     Attributes:
         `touch`: search, pairs and their terms, friction lag.
-        diagonal: (W N,) diagonal blocks, for preconditioners.
+        hessian: `ContactHessian` at the solution.
     """
 
     def __init__(self, coupled):
@@ -23,18 +23,12 @@ class ExactContact:
             coupled, wp.float64, coupled.rest().q, obstacle_nodes, MARGIN * contact.reach, exact=True
         )
         self.search, self.terms = self.touch.search, self.touch.terms
-        self.diagonal = self.terms.diagonal
-        self._q = self._bands = None
-
-    def bind(self, system) -> None:
-        """Attach to an `ExactSystem`."""
-        self._system = system
-        self._bands = ContactBands(system.chains, self.touch.shapes) if system.chains else None
+        self.hessian = ContactHessian(self.terms, self.touch.shapes)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [*self.search.kernels, *self.terms.kernels, *(self._bands.kernels if self._bands else [])]
+        return [*self.search.kernels, *self.terms.kernels, *self.hessian.kernels]
 
     def find(
         self, lagged: wp.array, before: wp.array, q: wp.array, rate: wp.array, rates: tuple = (None, None)
@@ -53,24 +47,7 @@ class ExactContact:
             terms.lag(lagged, rate=rate_at_lag)
         search.search(q)
         terms.evaluate(q, rate if terms.frictions else None, before)
-        terms.meet()
-        terms.prepare(q, self.coupled.every)
-        self._q = q
-
-    def assemble(self) -> None:
-        """Add contact to the preconditioner."""
-        if self._bands:
-            self.terms.join()
-            self._bands(self.terms, self._system.islands.arrays[0])
-
-    def spread(self, p: wp.array) -> None:
-        """Write the contributions of pairs to H p."""
-        self.terms.place(p, self._q, self.coupled.every)
-
-    def settle(self, p: wp.array, product: wp.array) -> None:
-        """Add the contributions of pairs to the product, and write p . H p block by block."""
-        system = self._system
-        self.terms.settle(p, product, system.inactive_mask, system.islands.needs_direction, system.krylov_dots)
+        self.hessian.linearise(q, self.coupled.every)
 
     def has_overflow(self, q: wp.array) -> bool:
         """Return True if lists of pairs overflowed and have grown. Reads from the device."""

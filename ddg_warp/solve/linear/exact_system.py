@@ -10,6 +10,7 @@ from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.coupled_element import coupled_storage
 from ddg_warp.kernels.linear.exact_hessian import COUNT, FIRST, SIGN, exact_kernels
 from ddg_warp.model.coupled_model import CoupledState
+from ddg_warp.solve.linear.linear_system import LinearSystem
 from ddg_warp.solve.linear.pcg import PCG
 from ddg_warp.solve.linear.rod_substructuring import RodSubstructuring
 from ddg_warp.solve.linear.skew_supports import SkewSupports
@@ -20,9 +21,9 @@ from ddg_warp.solve.linear.sparse_system import SparseSystem
 class ExactSystem:
     """Linear system (H + c M) w = g on the free dofs of every world, with the exact Hessian H at the solution of a step.
 
-    The solve resembles a direction of `CoupledNewton`, and has the same attributes for `PCG`. But all of H is in one array, in
-    float64 whatever the precision of the model, and the tolerance is its own. H is symmetric, as drag is, and loads do not follow
-    within a step; it may be indefinite, at a saddle. The host reads nothing.
+    The solve resembles a direction of `CoupledNewton`. But all of H is in one array, in float64 whatever the precision of the model,
+    and the tolerance is its own. H is symmetric, as drag is, and loads do not follow within a step; it may be indefinite, at a
+    saddle. The host reads nothing.
 
     Measured: on a CPU the reverse of a step takes a quarter to a half of the time of sparse factors where rods branch. Large sheets
     and gridshells take up to twice and three times that time (tools/results/gradient_nets_cpu.csv).
@@ -43,32 +44,25 @@ class ExactSystem:
     def __init__(self, model, inertia: wp.array | None = None, contact=None):
         self.contact = contact
         coupled, real = model.coupled, model.types.real
-        self.coupled, self.device, self.real, self.linear = coupled, coupled.device, real, wp.float64
+        self.coupled, self.device, self.linear = coupled, coupled.device, wp.float64
         worlds, host, device = coupled.worlds, coupled.host, coupled.device
-        self.worlds, self.all = worlds, worlds * coupled.blocks
-        H = wp.types.vector(3, self.linear)
 
         def make(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        preconditioner = coupled_preconditioner(coupled)
+        preconditioner, drag = coupled_preconditioner(coupled), inertia is not None
         self.chains = RodSubstructuring.of(coupled, preconditioner, banded=False)
-        self.system = SparseSystem(coupled)
-        self.planes = SkewSupports(coupled, self.system, real, self.linear) if host.frames else None
-        self.fixed = self.bits(host.fixed)
-        self.inactive_mask = wp.array(np.tile(self.fixed.numpy(), worlds), dtype=wp.uint8, device=device)
-        self.mass = coupled.mass if inertia is None else inertia
-        self.rhs, self.direction = (make(self.all, H) for _ in range(2))
-        self.matrix = make((9, worlds * self.system.positions), self.linear)
-        self.krylov_dots = make((worlds, coupled.blocks), self.linear)
-        self.iterations, self.indefinite, self.failed = (make(worlds, int) for _ in range(3))
-        self.forcing = make(worlds, self.linear)
-        self.islands = self.anew = Islands(worlds, real, device)
-        drag = inertia is not None
+        self.sparsity = SparseSystem(coupled)
+        self.planes = SkewSupports(coupled, self.sparsity, real, self.linear) if host.frames else None
         if self.chains:
-            self.chains.bind(self.system, [], real, self.linear, (), drag)
-        if contact:
-            contact.bind(self)
+            self.chains.bind(self.sparsity, [], real, self.linear, (), drag)
+            if contact:
+                contact.hessian.bind(self.chains)
+        self.mass = inertia if drag else coupled.mass
+        self.islands = Islands(worlds, real, device)
+        wanted = self.islands.needs_direction
+        self.system = LinearSystem.of(coupled, self.sparsity, self.chains, self.linear, wanted, wanted)
+        self.failed = make(worlds, int)
         self._begin, self._add = exact_kernels(real, self.linear, drag, device_arrays.serial(device))
         self._into, self._back, self._keep = block_kernels(real, self.linear)
         self._rest, self._check = check_kernels(self.linear)
@@ -81,11 +75,8 @@ class ExactSystem:
         self._written = [hessians[: n * size**2].reshape((n, size, size)) for n, size in zip(count, sizes, strict=True)]
         self._no_stress = make((0, 0), real)
         self._ends = [wp.array(_ends(part.term.measure), dtype=int, device=device) for part in coupled.sets]
-        self.krylov = PCG(self, preconditioner.endswith("multilevel"), indefinite=True)
-
-    def bits(self, dofs: np.ndarray) -> wp.array:
-        """Return dofs (blocks, 3) bool as bits of blocks."""
-        return wp.array((dofs * [1, 2, 4]).sum(1).astype(np.uint8), dtype=wp.uint8, device=self.device)
+        multilevel, hessian = preconditioner.endswith("multilevel"), contact and contact.hessian
+        self.krylov = PCG(coupled, self.sparsity, self.chains, hessian, self.linear, multilevel, indefinite=True)
 
     @property
     def kernels(self) -> list:
@@ -102,32 +93,34 @@ class ExactSystem:
             coefficient: c [1/s^2].
             rate: inverse time of strain-rate damping of every world [1/s].
         """
-        self.islands.needs_direction.fill_(1)
+        system = self.system
+        system.wanted.fill_(1)
         self.islands.inertia_coefficient.fill_(coefficient)
         self.assemble(state, rate)
-        self._launch(self._into, self.all, [rhs], [self.rhs])
+        self._launch(self._into, len(rhs), [rhs], [system.rhs])
         if self.planes:
-            self.planes.into(self.rhs, self.islands.needs_direction)
-        self._launch(self._keep, self.all, [self.fixed, self.coupled.blocks], [self.rhs])
-        self.forcing.fill_(self.tolerance)
-        self.krylov.solve()
+            self.planes.into(system.rhs, system.wanted)
+        self._launch(self._keep, len(rhs), [system.masks.fixed, self.coupled.blocks], [system.rhs])
+        system.forcing.fill_(self.tolerance)
+        self.krylov.solve(system)
         self.check()
-        self._give(self.direction, w)
+        self._give(system.direction, w)
 
     def part(self, values: wp.array, left_out: wp.array, out: wp.array) -> None:
         """Write `values` (W N,) without the components at dofs with set bits, in the nodal frames of skew supports, if any."""
-        self._launch(self._into, self.all, [values], [self.rhs])
+        rhs = self.system.rhs
+        self._launch(self._into, len(rhs), [values], [rhs])
         if self.planes:
-            self.planes.into(self.rhs, self.coupled.every)
-        self._launch(self._keep, self.all, [left_out, self.coupled.blocks], [self.rhs])
-        self._give(self.rhs, out)
+            self.planes.into(rhs, self.coupled.every)
+        self._launch(self._keep, len(rhs), [left_out, self.coupled.blocks], [rhs])
+        self._give(rhs, out)
 
     def assemble(self, state: CoupledState, rate: wp.array) -> None:
         """Assemble H of all worlds."""
-        table, flags = self.system, self.islands.arrays[0]
-        every = device_arrays.takers(self.matrix.shape[1], self.device)
+        system, table, flags = self.system, self.sparsity, self.islands.arrays[0]
+        every = device_arrays.takers(system.matrix.shape[1], self.device)
         read = [self.mass, *self.islands.arrays, table.rows, table.columns, table.positions]
-        self._launch(self._begin, every, read, [self.matrix])
+        self._launch(self._begin, every, read, [system.matrix])
         for i, (kernel, hessian) in enumerate(zip(self._hessians, self._written, strict=True)):
             inputs = self.coupled.elements(state, i, rate=rate)
             grid = self.coupled.worlds, self.coupled.sets[i].elements, hessian.shape[1]
@@ -140,30 +133,31 @@ class ExactSystem:
                 flags,
                 table.positions,
             ]
-            self._launch(self._add, every, read, [self.matrix])
+            self._launch(self._add, every, read, [system.matrix])
         if self.planes:
-            self.planes.matrix(self.matrix, self.islands.needs_direction)
+            self.planes.matrix(system.matrix, system.wanted)
         if self.chains:
-            self.chains.assemble(self.matrix, self.mass, self.islands)
+            self.chains.assemble(system.matrix, self.mass, self.islands)
         if self.contact:
-            self.contact.assemble()
+            self.contact.hessian.assemble()
+            self.contact.hessian.add_to_bands(flags)
 
     def check(self) -> None:
         """Set `failed` from the residual of the solution."""
-        krylov, wanted = self.krylov, self.islands.needs_direction
-        wanted.fill_(1)
-        krylov.multiply(self.direction)
-        read = [self.rhs, krylov.product, krylov.inverse, self.coupled.blocks]
-        self._launch(self._rest, self.all, read, [krylov.rest, krylov.z, self.krylov_dots])
-        krylov.precondition(krylov.z)
-        krylov.sum(self.krylov_dots, krylov.total)
-        self._launch(self._check, self.worlds, [krylov.total, krylov.rho_first, self.missed], [self.failed])
+        krylov, system = self.krylov, self.system
+        system.wanted.fill_(1)
+        krylov.multiply(system, system.direction)
+        read = [system.rhs, krylov.product, krylov.inverse, self.coupled.blocks]
+        self._launch(self._rest, len(system.rhs), read, [krylov.rest, krylov.z, system.dots])
+        krylov.precondition(system, krylov.z)
+        krylov.sum(system.dots, krylov.total)
+        self._launch(self._check, self.coupled.worlds, [krylov.total, krylov.rho_first, self.missed], [self.failed])
 
     def _give(self, values: wp.array, out: wp.array) -> None:
         """Write blocks in the precision of the model, in spatial components."""
         if self.planes:
             self.planes.back(values, self.coupled.every)
-        self._launch(self._back, self.all, [values], [out])
+        self._launch(self._back, len(out), [values], [out])
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.device)

@@ -1,6 +1,7 @@
 """Preconditioned conjugate gradients on all worlds of the coupled system, on a device; see `kernels.linear.coupled_pcg`."""
 
 import math
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -32,10 +33,12 @@ def natural_scale(coupled) -> float:
 
 
 class PCG:
-    """Preconditioned conjugate gradients for H d = r, to the forcing term `forcing` in the preconditioner norm.
+    """Preconditioned conjugate gradients for `LinearSystem`s, to the forcing term in the preconditioner norm.
 
     Args:
-        newton: a `CoupledNewton`, or an object with the same names, whose matrix, residual, direction and substructuring are used.
+        `sparsity`: `SparseSystem` of H; `chains`: `RodSubstructuring` of the preconditioner or None, with blocks of H in bands.
+        contact: `ContactHessian` to add to H, or None.
+        linear: scalar type of the systems.
         multilevel: True to add BPX multilevel corrections, or to use these alone; see `kernels.linear.multilevel`.
         scale: power of two by which residuals and directions are scaled, against underflow and overflow of products; see
             `natural_scale`.
@@ -49,21 +52,24 @@ class PCG:
         `sum`: sums of block values over each world.
     """
 
-    def __init__(self, newton, multilevel: bool, indefinite: bool = False, scale: float = 1.0):
-        self._scale, self._unit = newton.linear(scale), newton.linear(1.0 / scale)
-        self.newton, coupled, linear, device = newton, newton.coupled, newton.linear, newton.device
+    def __init__(
+        self, coupled, sparsity, chains, contact, linear, multilevel: bool, indefinite: bool = False, scale: float = 1.0
+    ):
+        self._scale, self._unit = linear(scale), linear(1.0 / scale)
+        self.coupled, self.sparsity, self.chains, self.contact = coupled, sparsity, chains, contact
+        worlds, count, device = coupled.worlds, coupled.worlds * coupled.blocks, coupled.device
         H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
-        self.rest, self.z, self.p, self.product = (wp.zeros(newton.all, dtype=H, device=device) for _ in range(4))
-        self.inverse = wp.zeros(newton.all, dtype=M, device=device)
+        self.rest, self.z, self.p, self.product = (wp.zeros(count, dtype=H, device=device) for _ in range(4))
+        self.inverse = wp.zeros(count, dtype=M, device=device)
         self.rho, self.rho_first, self.total, self.curvature = (
-            wp.zeros(newton.worlds, dtype=linear, device=device) for _ in range(4)
+            wp.zeros(worlds, dtype=linear, device=device) for _ in range(4)
         )
         self.busy = wp.zeros(1, dtype=int, device=device)
-        self._unread = [wp.zeros(newton.worlds, dtype=int, device=device) for _ in range(2)]
-        self.sum = Sums(newton.worlds, coupled.blocks, linear, device)
+        self._unread = [wp.zeros(worlds, dtype=int, device=device) for _ in range(2)]
+        self.sum = Sums(worlds, coupled.blocks, linear, device)
         self._invert, self._start, self._begin, *self._cycle = coupled_pcg.solver_kernels(linear, indefinite)
-        self._more = newton.contact.diagonal if newton.contact else wp.zeros(0, dtype=M, device=device)
-        self.levels = Multilevel(coupled, newton.system, linear) if multilevel else None
+        self._more = contact.diagonal if contact else wp.zeros(0, dtype=M, device=device)
+        self.levels = Multilevel(coupled, sparsity, linear) if multilevel else None
         self._limit = max(200, 100 * math.isqrt(coupled.blocks))
 
     @property
@@ -73,164 +79,143 @@ class PCG:
         return [self._invert, self._start, self._begin, *self._cycle, *self.sum.kernels, *levels]
 
     @timer("pcg")
-    def solve(self) -> None:
+    def solve(self, system) -> None:
         """Compute directions. Worlds with an indefinite H or preconditioner are marked and keep the present approximation."""
-        newton = self.newton
-        table, blocks, wanted, outdated = (
-            newton.system,
-            newton.coupled.blocks,
-            newton.islands.needs_direction,
-            newton.anew.needs_direction,
-        )
+        self.begin(system)
+        self.iterate(system)
+
+    def begin(self, system) -> None:
+        """Prepare the preconditioner, and start from zero directions."""
+        table, masks, blocks = self.sparsity, system.masks, self.coupled.blocks
         self._launch(
             self._invert,
-            [newton.matrix, table.diagonal, newton.inactive_mask, outdated, blocks, table.positions, self._more],
+            [system.matrix, table.diagonal, masks.inactive, system.outdated, blocks, table.positions, self._more],
             [self.inverse],
         )
         self._launch(
             self._start,
-            [newton.rhs, self.inverse, table.diagonal, newton.inactive_mask, wanted, blocks, self._scale],
-            [self.rest, newton.direction, self.p, newton.krylov_dots],
+            [system.rhs, self.inverse, table.diagonal, masks.inactive, system.wanted, blocks, self._scale],
+            [self.rest, system.direction, self.p, system.dots],
         )
-        if newton.chains:
-            newton.chains.prepare(newton.matrix, newton.fixed, outdated, self._unread[0])
+        if self.chains:
+            self.chains.prepare(system, self._unread[0])
         if self.levels:
-            self.levels.prepare(newton.matrix, newton.fixed, outdated)
-        self.precondition(self.p)
-        self.sum(newton.krylov_dots, self.total)
+            self.levels.prepare(system.matrix, masks.fixed, system.outdated)
+        self.precondition(system, self.p)
+        self.sum(system.dots, self.total)
         self.busy.zero_()
-        wp.launch(
-            self._begin,
-            newton.worlds,
-            [self.total],
-            [wanted, self.rho, self.rho_first, newton.iterations, newton.indefinite, self.busy],
-            device=newton.device,
-        )
-        self.iterate()
+        outputs = [system.wanted, self.rho, self.rho_first, system.iterations, system.indefinite, self.busy]
+        wp.launch(self._begin, self.coupled.worlds, [self.total], outputs, device=self.coupled.device)
 
-    def iterate(self) -> None:
-        """Iterate until the residual is small in the norm of the preconditioner."""
-        wp.capture_while(self.busy, self.cycle)
+    def iterate(self, system, after_cycle: Callable[[], None] | None = None) -> None:
+        """Iterate until the residual is small in the norm of the preconditioner; `after_cycle` may end a solve earlier."""
+
+        def cycle() -> None:
+            self.cycle(system)
+            if after_cycle:
+                after_cycle()
+
+        wp.capture_while(self.busy, cycle)
 
     @timer("preconditioner")
-    def precondition(self, z: wp.array) -> None:
+    def precondition(self, system, z: wp.array) -> None:
         """Apply substructuring and multilevel to z, on entry the residual times inverse diagonal blocks; write r . z."""
-        newton = self.newton
-        wanted, dots = newton.islands.needs_direction, newton.krylov_dots
-        if newton.chains:
-            newton.chains.apply(newton.matrix, self.rest, newton.inactive_mask, wanted, z, dots)
+        if self.chains:
+            self.chains.apply(system, self.rest, z)
         if self.levels:
-            self.levels.apply(self.rest, newton.inactive_mask, wanted, z, dots)
+            self.levels.apply(self.rest, system.masks.inactive, system.wanted, z, system.dots)
 
-    def cycle(self) -> None:
+    def cycle(self, system) -> None:
         """Run one iteration."""
-        newton = self.newton
-        blocks, wanted, dots = newton.coupled.blocks, newton.islands.needs_direction, newton.krylov_dots
+        blocks, inactive, wanted, dots = self.coupled.blocks, system.masks.inactive, system.wanted, system.dots
         _, advance, turn, test = self._cycle
-        self.multiply(self.p)
+        self.multiply(system, self.p)
         self.sum(dots, self.curvature)
         self._launch(
             advance,
-            [self.p, self.product, self.inverse, newton.system.diagonal, newton.inactive_mask, self.rho, self.curvature]
-            + [newton.iterations, wanted, blocks, self._unit],
-            [newton.direction, self.rest, self.z, dots, self.busy],
+            [self.p, self.product, self.inverse, self.sparsity.diagonal, inactive, self.rho, self.curvature]
+            + [system.iterations, wanted, blocks, self._unit],
+            [system.direction, self.rest, self.z, dots, self.busy],
         )
-        self.precondition(self.z)
+        self.precondition(system, self.z)
         self.sum(dots, self.total)
-        self._launch(turn, [self.z, self.total, self.rho, newton.inactive_mask, wanted, blocks], [self.p])
+        self._launch(turn, [self.z, self.total, self.rho, inactive, wanted, blocks], [self.p])
         wp.launch(
             test,
-            newton.worlds,
-            [self.total, self.curvature, self.rho_first, newton.forcing, self._limit],
-            [self.rho, newton.iterations, newton.indefinite, wanted, self.busy],
-            device=newton.device,
+            self.coupled.worlds,
+            [self.total, self.curvature, self.rho_first, system.forcing, self._limit],
+            [self.rho, system.iterations, system.indefinite, wanted, self.busy],
+            device=self.coupled.device,
         )
 
     @timer("product")
-    def multiply(self, p: wp.array) -> None:
+    def multiply(self, system, p: wp.array) -> None:
         """Write H p on active dofs, and p . H p block by block; no matrix has the contact terms."""
-        newton, contact = self.newton, self.newton.contact
-        multiply_elements = self.multiply_bands if newton.chains and newton.chains.banded else self.multiply_matrix
-        if not contact:
-            multiply_elements(p)
+        if self.chains and self.chains.banded:  # elements along rods are stored in bands
+            elements = partial(self.chains.product, system, p, self.product)
+        else:
+            elements = partial(self.multiply_matrix, system, p)
+        if not self.contact:
+            elements()
             return
-        device_arrays.side_by_side([partial(multiply_elements, p), partial(contact.spread, p)], newton.device)
-        contact.settle(p, self.product)
+        device_arrays.side_by_side([elements, partial(self.contact.spread, p)], self.coupled.device)
+        self.contact.settle(p, self.product, system)
 
-    def multiply_bands(self, p: wp.array) -> None:
-        """Write the product without contact, with elements along rods stored in bands."""
-        newton = self.newton
-        wanted, dots = newton.islands.needs_direction, newton.krylov_dots
-        newton.chains.product(newton.matrix, p, newton.inactive_mask, wanted, self.product, dots)
-
-    def multiply_matrix(self, p: wp.array) -> None:
+    def multiply_matrix(self, system, p: wp.array) -> None:
         """Write the product without contact, with all of H in the sparse matrix."""
-        newton = self.newton
-        table, wanted = newton.system, newton.islands.needs_direction
-        self._launch(
-            self._cycle[0],
-            [
-                newton.matrix,
-                table.columns,
-                table.slices,
-                newton.inactive_mask,
-                p,
-                wanted,
-                newton.coupled.blocks,
-                table.positions,
-            ],
-            [self.product, newton.krylov_dots],
-        )
+        table = self.sparsity
+        inputs = [system.matrix, table.columns, table.slices, system.masks.inactive, p, system.wanted]
+        inputs += [self.coupled.blocks, table.positions]
+        self._launch(self._cycle[0], inputs, [self.product, system.dots])
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         """Launch one thread a block of every world."""
-        wp.launch(kernel, self.newton.all, inputs, outputs, device=self.newton.device)
+        wp.launch(kernel, len(self.z), inputs, outputs, device=self.coupled.device)
 
 
 class NewtonPCG(PCG):
-    """Directions of a `CoupledNewton` to the accuracy of `forcing` and `goal`; `scale` as of `PCG`."""
+    """Directions of a `CoupledNewton` to the forcing term and the goal of the system; see `PCG`.
 
-    def __init__(self, newton, multilevel: bool):
-        self.scale = natural_scale(newton.coupled)
-        super().__init__(newton, multilevel, scale=self.scale)
-        real = newton.real
-        self._worst = Sums(newton.worlds, newton.allowed.ratio.shape[1], real, newton.device, largest=True)
-        self._compare, self._confirm = coupled_pcg.confirm_kernels(real, newton.linear)
+    Args:
+        tolerances: `ResidualTolerances`, whose ratios are overwritten; rtol: relative tolerance.
+        relaxed: `RelaxedConvergence`, or None.
+    """
+
+    def __init__(self, coupled, sparsity, chains, contact, linear, multilevel: bool, tolerances, rtol: float, relaxed):
+        self.scale, real = natural_scale(coupled), coupled.real
+        super().__init__(coupled, sparsity, chains, contact, linear, multilevel, scale=self.scale)
+        self._tolerances, self._rtol, self._relaxed = tolerances, rtol, relaxed
+        self._largest = Sums(coupled.worlds, tolerances.ratio.shape[1], real, coupled.device, largest=True)
+        self._worst = wp.zeros(coupled.worlds, dtype=real, device=coupled.device)
+        self._compare, self._confirm = coupled_pcg.confirm_kernels(real, linear)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [*super().kernels, self._compare, self._confirm, *self._worst.kernels]
+        return [*super().kernels, self._compare, self._confirm, *self._largest.kernels]
 
-    def iterate(self) -> None:
-        """Iterate until the residual is small in the norm of the preconditioner and by the tolerance."""
-        wp.capture_while(self.busy, self.reduce)
+    @timer("pcg")
+    def solve(self, system, islands, after_cycle: Callable[[], None] | None = None) -> None:
+        """Compute directions; see `PCG.solve` and, for `after_cycle`, `PCG.iterate`."""
+        self.begin(system)
+        wp.capture_while(self.busy, lambda: self.reduce(system, islands, after_cycle))
 
-    def reduce(self) -> None:
+    def reduce(self, system, islands, after_cycle: Callable[[], None] | None) -> None:
         """Iterate to the forcing term, then test the residual tolerance."""
-        newton, few = self.newton, self.newton.unconverged_fraction
-        super().iterate()
-        self.compare()
-        self._worst(newton.allowed.ratio, newton.worst)
+        few = self._relaxed
+        self.iterate(system, after_cycle)
+        self.compare(system, islands)
+        self._largest(self._tolerances.ratio, self._worst)
         if few:
-            few.count(SPARE * newton.options.rtol)
+            few.count(SPARE * self._rtol, self._tolerances.ratio, islands)
         number, most = (few.number, int(SPARE * few.most)) if few else (self._unread[0], 0)
-        wp.launch(
-            self._confirm,
-            newton.worlds,
-            [newton.worst, newton.goal, number, most, FARTHEST, newton.limit],
-            [newton.forcing, newton.islands.needs_direction, self.busy],
-            device=newton.device,
-        )
+        inputs = [self._worst, system.goal, number, most, FARTHEST, system.limit]
+        outputs = [system.forcing, system.wanted, self.busy]
+        wp.launch(self._confirm, self.coupled.worlds, inputs, outputs, device=self.coupled.device)
 
-    def compare(self) -> None:
-        """Write ratios of `CoupledNewton.allowed` for linear residuals, in worlds with a finished solve."""
-        newton, allowed = self.newton, self.newton.allowed
-        inputs = [self.rest, allowed.blocks, newton.islands.needs_direction, newton.coupled.blocks, self._unit]
-        self._launch(self._compare, inputs, [self.z, allowed.ratio])  # worlds that continue overwrite z
-        allowed.sum_up(self.z, newton.options.rtol, newton.islands, *self._unread)
-
-    def cycle(self) -> None:
-        """Run one iteration, and watch the length of directions."""
-        super().cycle()
-        self.newton.watch()
+    def compare(self, system, islands) -> None:
+        """Write the ratios of linear residuals over tolerances, in worlds with a finished solve."""
+        tolerances = self._tolerances
+        inputs = [self.rest, tolerances.blocks, system.wanted, self.coupled.blocks, self._unit]
+        self._launch(self._compare, inputs, [self.z, tolerances.ratio])  # worlds that continue overwrite z
+        tolerances.sum_up(self.z, self._rtol, islands, *self._unread)

@@ -213,29 +213,27 @@ class RodSubstructuring:
             inputs = [self.taken, islands.needs_direction, self.table.positions]
             self._launch(self._clear, (self.taken.size, self.coupled.worlds), inputs, [matrix])
 
-    def product(self, matrix, p: wp.array, inactive_mask, wanted, product: wp.array, dots: wp.array) -> None:
+    def product(self, system, p: wp.array, product: wp.array) -> None:
         """Write H p, bands included, and p . H p block by block."""
         table, coupled, threads = self.table, self.coupled, 1
-        inputs = [matrix, table.columns, table.slices, inactive_mask, p, wanted, coupled.blocks, table.positions]
-        inputs += [self.bands, self.places, self.count, self.idle]
+        inputs = [system.matrix, table.columns, table.slices, system.masks.inactive, p, system.wanted]
+        inputs += [coupled.blocks, table.positions, self.bands, self.places, self.count, self.idle]
         if not device_arrays.serial(self.device):
             of_places = -(-self.columns // TILE) * TILE * self.longest
             inputs += [of_places, self._at_none]
             threads = of_places + coupled.worlds * len(self._at_none)
-        self._launch(self._product, threads, inputs, [product, dots])
+        self._launch(self._product, threads, inputs, [product, system.dots])
 
     @timer("factorise and solve")
-    def direct(
-        self, matrix, mass, islands, updated_islands, fixed, inactive_mask, rhs, lost: wp.array, z: wp.array, dots
-    ) -> None:
-        """Write H^-1 r of the worlds that need a direction, if `exact`; raise `lost` where H is indefinite.
+    def direct(self, system, mass, islands, updated_islands) -> None:
+        """Write the directions of a `LinearSystem`, if `exact`; raise its flag where H is indefinite.
 
         `updated_islands` are the islands whose H is new.
         """
         if not self._walk:
-            self.assemble(matrix, mass, updated_islands)
-            self.prepare(matrix, fixed, updated_islands.needs_direction, lost)
-            self.apply(matrix, rhs, inactive_mask, islands.needs_direction, z, dots)
+            self.assemble(system.matrix, mass, updated_islands)
+            self.prepare(system, system.indefinite)
+            self.apply(system, system.rhs, system.direction)
             if self.split:
                 inputs = [*islands.arrays, self.layout, self._own, self.values]
                 self._launch(self._lengthen, (self.longest, self.columns), inputs, [self.longer])
@@ -243,113 +241,84 @@ class RodSubstructuring:
         self._launch(
             self._walk,
             self.columns,
-            [matrix, mass, *islands.arrays, self.layout, self._own, rhs, self.coupled.blocks],
-            [self.factors, self.values, lost, z],
+            [system.matrix, mass, *islands.arrays, self.layout, self._own, system.rhs, self.coupled.blocks],
+            [self.factors, self.values, system.indefinite, system.direction],
         )
         if self.joints:
-            self._prepare_joints(matrix, fixed, islands.needs_direction, lost)
-            self._apply_joints(matrix, rhs, inactive_mask, islands.needs_direction, z, dots)
+            self._prepare_joints(system, system.indefinite)
+            self._apply_joints(system, system.rhs, system.direction)
 
     @timer("factorise")
-    def prepare(self, matrix: wp.array, fixed: wp.array, wanted: wp.array, lost: wp.array) -> None:
-        """Factorise rod paths and joints of the worlds that need a direction; raise `lost` where one is indefinite."""
-        self._lost = lost
+    def prepare(self, system, lost: wp.array) -> None:
+        """Factorise rod paths and joints of the worlds with a new H; raise `lost` where one is indefinite."""
+        self._lost, outdated = lost, system.outdated
         if self.reduction and self.reduction.repeats:
-            self._spread(wanted)
+            self._spread(outdated)
             self.reduction.factorise(self.eliminated, self._all, self._wanted, self._bad)
             self._note()
         elif self._both:
-            self._both.factorise(self.eliminated, self.count, self.idle, wanted, self.factors, lost)
+            self._both.factorise(self.eliminated, self.count, self.idle, outdated, self.factors, lost)
         elif not self.reduction:
-            self._launch(
-                self._factorise,
-                self.columns,
-                [self.eliminated, self.count, self.idle, wanted],
-                [self.factors, lost],
-                SERIAL,
-            )
+            inputs = [self.eliminated, self.count, self.idle, outdated]
+            self._launch(self._factorise, self.columns, inputs, [self.factors, lost], SERIAL)
         if self.joints:
-            self._prepare_joints(matrix, fixed, wanted, lost)
+            self._prepare_joints(system, lost)
 
-    def apply(self, matrix, residual, inactive_mask, wanted, z: wp.array, dots: wp.array) -> None:
+    def apply(self, system, residual: wp.array, z: wp.array) -> None:
         """Write z of rod and joint blocks from the residual, and r . z block by block; other blocks keep block Jacobi's z.
 
-        Blocks whose dofs are all set in `inactive_mask` (W N,) keep their z.
+        Blocks without active dofs keep their z.
         """
-        inputs = residual, self.places, self.held, self.count, self.idle, wanted, self.coupled.blocks
+        inputs = residual, self.places, self.held, self.count, self.idle, system.wanted, self.coupled.blocks
         if self._walk_places:
-            self._launch(self._walk_places, self.columns, [self.factors, *inputs], [self.values, z, dots], SERIAL)
+            outputs = [self.values, z, system.dots]
+            self._launch(self._walk_places, self.columns, [self.factors, *inputs], outputs, SERIAL)
             return
         if self._both:
-            self._both.solve(self.factors, inputs, self.values, z, dots)
+            self._both.solve(self.factors, inputs, self.values, z, system.dots)
             return
         if self._at_places:
-            self.reduction.again_at_places(self.plan.twist, *inputs, z, dots)
+            self.reduction.again_at_places(self.plan.twist, *inputs, z, system.dots)
             return
-        self._eliminate(matrix, wanted, self.values, residual, None)
-        self._apply_joints(matrix, residual, inactive_mask, wanted, z, dots)
+        self._eliminate(system, system.wanted, self.values, residual, None)
+        self._apply_joints(system, residual, z)
 
-    def _prepare_joints(self, matrix, fixed, wanted, lost: wp.array) -> None:
+    def _prepare_joints(self, system, lost: wp.array) -> None:
         """Factorise the joints, after the rod paths."""
         if self.has_links:
-            self._eliminate(matrix, wanted, self.responses, None, self.units)
-        self._launch(
-            self._measure,
-            self.coupled.worlds * self.joints,
-            [matrix, *self._joint_inputs(self.responses), self.own, self.colour, self.plan.size, fixed, wanted]
-            + [self.table.positions],
-            [self.parts, lost],
-        )
+            self._eliminate(system, system.outdated, self.responses, None, self.units)
+        inputs = [system.matrix, *self._joint_inputs(self.responses), self.own, self.colour, self.plan.size]
+        inputs += [system.masks.fixed, system.outdated, self.table.positions]
+        self._launch(self._measure, self.coupled.worlds * self.joints, inputs, [self.parts, lost])
 
-    def _apply_joints(self, matrix, residual, inactive_mask, wanted, z: wp.array, dots: wp.array) -> None:
+    def _apply_joints(self, system, residual: wp.array, z: wp.array) -> None:
         """Complete z from the residual eliminated along rod paths."""
-        coupled = self.coupled
+        coupled, wanted = self.coupled, system.wanted
         if self.joints:
-            self._launch(
-                self._meet,
-                coupled.worlds * self.joints,
-                [matrix, *self._joint_inputs(self.values), self.parts, residual, wanted, coupled.blocks]
-                + [self.table.positions],
-                [self.moved],
-            )
+            inputs = [system.matrix, *self._joint_inputs(self.values), self.parts, residual, wanted, coupled.blocks]
+            inputs += [self.table.positions]
+            self._launch(self._meet, coupled.worlds * self.joints, inputs, [self.moved])
         if self.met is not None:
-            self._launch(
-                self._follow,
-                (self.longest, self.columns),
-                [self.met, self.count, wanted, self.responses, self.moved, self.joint_rows],
-                [self.values],
-            )
+            inputs = [self.met, self.count, wanted, self.responses, self.moved, self.joint_rows]
+            self._launch(self._follow, (self.longest, self.columns), inputs, [self.values])
         elif self.has_links:
-            self._eliminate(matrix, wanted, self.values, residual, self.moved)
-        self._launch(
-            self._finish,
-            device_arrays.takers(coupled.worlds * coupled.blocks, self.device),
-            [
-                residual,
-                self.values,
-                self.where,
-                self.width,
-                self.joint_row,
-                self.joint_rows,
-                self.moved,
-                inactive_mask,
-                wanted,
-            ]
-            + [coupled.blocks, coupled.host.nodes],
-            [z, dots],
-        )
+            self._eliminate(system, wanted, self.values, residual, self.moved)
+        inputs = [residual, self.values, self.where, self.width, self.joint_row, self.joint_rows, self.moved]
+        inputs += [system.masks.inactive, wanted, coupled.blocks, coupled.host.nodes]
+        threads = device_arrays.takers(coupled.worlds * coupled.blocks, self.device)
+        self._launch(self._finish, threads, inputs, [z, system.dots])
 
     def _joint_inputs(self, values: wp.array) -> list:
         chains = [self.joint_starts, self.joint_items, values, self.where, self.width, self.coupled.host.nodes]
         return [self.table.columns, *chains, self.pairs]
 
-    def _eliminate(self, matrix, wanted, values: wp.array, residual, moved) -> None:
+    def _eliminate(self, system, wanted: wp.array, values: wp.array, residual, moved) -> None:
         """Write H_II^-1 (r_I - H_IJ z_J), for one joint movement or all; None for `residual` or `moved` means zero."""
         table, coupled, solves = self.table, self.coupled, values.shape[2] // self.columns
         self._launch(
             self._load,
             (device_arrays.takers(self.longest, self.device), solves * self.columns),
-            [matrix, table.columns, self.places, self.count, self.idle, self.held, self.starts, self.items]
+            [system.matrix, table.columns, self.places, self.count, self.idle, self.held, self.starts, self.items]
             + [self.joint_row, self.joint_rows, wanted, coupled.blocks, table.positions, int(residual is not None)]
             + [int(moved is not None), self.moved if residual is None else residual]
             + [self.moved if moved is None else moved],

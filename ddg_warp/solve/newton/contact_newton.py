@@ -1,8 +1,8 @@
 """Contact in Newton's method on the coupled system; see `kernels.newton.contact_newton` and, for search and pairs, `solve.collision`.
 
 CCD limits every proposed motion, a predictor or a step, rod by rod. Motion of supports and obstacles is included. A world whose
-predictor or support motion was limited has motion pending. Its target `bound` then lies ahead of its positions: all terms but contact
-are evaluated there, and contact is linear about the positions. The next direction begins with the remaining motion.
+predictor or support motion was limited has motion pending. Its target `Iterates.proposed` then differs from its positions: all terms
+but contact are evaluated there, and contact is linear about the positions. The next direction begins with the remaining motion.
 """
 
 import math
@@ -18,7 +18,7 @@ from ddg_warp.scene.obstacles import Obstacle
 from ddg_warp.solve.collision.ccd_bodies import number_bodies, number_units
 from ddg_warp.solve.collision.contact_model import ContactModel
 from ddg_warp.solve.collision.statistics import ContactStatistics
-from ddg_warp.solve.linear.contact_bands import ContactBands
+from ddg_warp.solve.linear.contact_hessian import ContactHessian
 from ddg_warp.solve.linear.sparse_system import Sums
 from ddg_warp.solve.newton.rod_newton import FIRST_EXACT_ITERATION
 from ddg_warp.timers import timer
@@ -36,11 +36,13 @@ ROUNDING = 16.0  # ulps within which supports count as arrived
 class NewtonContact:
     """Contact of a `CoupledNewton`.
 
+    Args:
+        iterates: `Iterates` at rest positions; rate: inverse time over which slips count (worlds,) [1/s].
+        linear: scalar type of the linear algebra; psd: see `NewtonOptions`.
+
     Attributes:
         search, terms: candidates; contact potential and friction of active pairs.
-        forces (W N,) [N], stiffness (W N,) [N/m]: contact forces of blocks, and a bound on their stiffness.
-        diagonal: (W N,) diagonal blocks of the contact matrix.
-        bound: (W N,) target positions of worlds with pending motion; positions of all others.
+        hessian: `ContactHessian` at the last iterate.
         bodies: body of each block of a world (blocks,), -1 for none; and the largest possible number of bodies.
         `bends`: True if the matrix has the geometric stiffness of pairs; see `kernels.collision.contact.geometric_stiffness`.
         `has_friction`: True with friction; rate: inverse time over which slips count (worlds,) [1/s].
@@ -49,42 +51,29 @@ class NewtonContact:
         crossed: (1,) interpenetrating pairs refused in all steps so far; least: (1,) smallest gap [m].
     """
 
-    def __init__(self, newton, model):
-        self.newton, self.coupled, self._scene = newton, newton.coupled, model.scene
-        self._moves = bool(model.motions)
-        coupled, host, real, linear, device = (
-            newton.coupled,
-            newton.coupled.host,
-            newton.real,
-            newton.linear,
-            newton.device,
-        )
+    def __init__(self, model, iterates, rate: wp.array, linear, psd: str):
+        self.coupled, self._scene = model.coupled, model.scene
+        self._moves, self._eps = bool(model.motions), model.types.eps
+        coupled, host, real, device = model.coupled, model.coupled.host, model.coupled.real, model.coupled.device
         if host.frames:
             raise SceneError(
                 "contact: a support on an oblique plane of symmetry does not go with it; use an axis of space"
             )
-        if newton.frozen:
-            raise SceneError(
-                "contact: solver 'projective' keeps the matrix of a step, which contact changes; use 'newton'"
-            )
-        newton.q.assign(np.tile(host.rest, (coupled.worlds, 1)))
         # forces on obstacles are post-processing of states
-        self.touch = ContactModel(coupled, linear, newton.q, host.of_obstacles)
-        self.shapes, self.search, self.terms = self.touch.shapes, self.touch.search, self.touch.terms
-        self.has_friction, self.rate = host.touching.has_friction, newton.islands.inverse_step
+        self.touch = ContactModel(coupled, linear, iterates.q, host.of_obstacles)
+        self.search, self.terms = self.touch.search, self.touch.terms
+        self.hessian = ContactHessian(self.terms, self.touch.shapes)
+        self.has_friction, self.rate = host.touching.has_friction, rate
         worlds, updates = coupled.worlds, self.touch.law.friction_iterations - 1 if self.has_friction else 0
-        self.forces, self.stiffness, self.diagonal = self.terms.forces, self.terms.stiffness, self.terms.diagonal
 
         def make(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
 
         self._modes, self._curved, self._projected = (make(worlds, int) for _ in range(3))
-        self.bends, self._late = newton.psd != "gauss_newton", 0 if newton.psd == "none" else FIRST_EXACT_ITERATION
+        self.bends, self._late = psd != "gauss_newton", 0 if psd == "none" else FIRST_EXACT_ITERATION
         self._kept, self._gain = make((2, worlds), real), make(worlds, real)
-        self.solutions = [make(newton.all, coupled.vector) for _ in range(updates)]
-        self._move = make(newton.all, coupled.vector)
-        self.bound = make(newton.all, coupled.vector)
-        self._way, self._pushed = (make(newton.all, wp.types.vector(3, linear)) for _ in range(2))
+        self.solutions, self._move = [wp.zeros_like(iterates.q) for _ in range(updates)], wp.zeros_like(iterates.q)
+        self._way, self._pushed = (make(len(iterates.q), wp.types.vector(3, linear)) for _ in range(2))
         self._going = make(1, int)
         self._longest, self.farthest = make(worlds, real), math.inf
         self._braced = make(worlds, int)
@@ -128,8 +117,8 @@ class NewtonContact:
             self._keep_solution,
         ) = built
         self._kernels += built
-        self._sum = Sums(worlds, newton.dots.shape[1], real, device)
-        self._bands = None
+        self._dots = make((worlds, device_arrays.takers(coupled.blocks, device)), real)
+        self._sum = Sums(worlds, self._dots.shape[1], real, device)
         self._least = LEAST * float(host.touching.range.min()) if self.touch.keep else -math.inf
         self._stiffest = float(host.touching.stiffness.max())
 
@@ -138,19 +127,15 @@ class NewtonContact:
         """Number of bodies in a world."""
         return len(np.setdiff1d(self.bodies[0], [-1]))
 
-    def bind(self, chains) -> None:
-        """Add contact to the matrix of the substructuring preconditioner, once its plan is made."""
-        self._bands = ContactBands(chains, self.shapes)
-
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        loaded = [*self._kernels, *(self._bands.kernels if self._bands else [])]
+        loaded = [*self._kernels, *self.hessian.kernels]
         return [*loaded, *self._sum.kernels, *self.search.kernels, *self.terms.kernels, *self.tally.kernels]
 
     def renew(self, before: wp.array) -> None:
         """Rebuild the BVHs of the search at positions `before`, on devices where searches only refit."""
-        if self.newton.device.is_cuda:
+        if self.coupled.device.is_cuda:
             self.search.rebuild(before)
 
     def see(self, x: wp.array) -> None:
@@ -167,141 +152,111 @@ class NewtonContact:
         if self.has_friction:
             self.terms.lag(x, again, rate)
 
-    def rest(self) -> None:
+    def rest(self, iterates, islands) -> None:
         """Clear all pending motion: the target is the iterate itself."""
-        wp.copy(self.bound, self.newton.q)
-        self.newton.islands.support_motion_pending.zero_()
+        wp.copy(iterates.proposed, iterates.q)
+        islands.support_motion_pending.zero_()
         self._going.zero_()
 
-    def lag_again(self, solution: wp.array) -> None:
+    def lag_again(self, solution: wp.array, iterates, islands) -> None:
         """Update the friction lag at the iterate of converged worlds, and keep that in one of `solutions`."""
-        newton = self.newton
-        self._sweep(self._keep_solution, [newton.q, newton.islands.substep_accepted, self.coupled.blocks], [solution])
-        self.lag(newton.q, again=True)
-        self._launch(self._again, self.coupled.worlds, [newton.islands.arrays[0]], [])
+        self._sweep(self._keep_solution, [iterates.q, islands.substep_accepted, self.coupled.blocks], [solution])
+        self.lag(iterates.q, again=True)
+        self._launch(self._again, self.coupled.worlds, [islands.arrays[0]], [])
 
-    def brace(self, dt: wp.array) -> None:
+    def brace(self, dt: wp.array, islands) -> None:
         """Add inertia to the contact stiffness where the last trial reached the minimum gap, in a step of dt (worlds,) [s]."""
         if self.terms.heavy:
             outputs = [self._braced, self.terms.law.rate]
-            self._launch(self._brace, self.coupled.worlds, [*self.newton.islands.arrays, dt], outputs)
+            self._launch(self._brace, self.coupled.worlds, [*islands.arrays, dt], outputs)
 
     @timer("CCD filter")
-    def place(self) -> None:
+    def place(self, iterates, system, islands) -> None:
         """Limit the predictor by CCD, once supports are at their prescribed positions."""
-        newton = self.newton
+        flags = islands.arrays[0]
         if len(self._nodes):
-            inputs = [self._nodes, self.coupled.blocks, newton.q]
+            inputs = [self._nodes, self.coupled.blocks, iterates.q]
             self._launch(self._aim, (len(self._nodes), self.coupled.worlds), inputs, [self._aims])
-        self._launch(
-            self._find_predicted, self.coupled.worlds, [newton.islands.arrays[0]], [self._modes, self._longest]
-        )
-        self._cut()
-        self._launch(self._find_short, self.coupled.worlds, [self._modes, self.search.time], [newton.islands.arrays[0]])
-        self._let_go()
+        self._launch(self._find_predicted, self.coupled.worlds, [flags], [self._modes, self._longest])
+        self._cut(iterates, system, islands)
+        self._launch(self._find_short, self.coupled.worlds, [self._modes, self.search.time], [flags])
+        self._let_go(iterates, islands)
 
     @timer("contact")
-    def evaluate(self) -> None:
+    def evaluate(self, iterates, islands) -> None:
         """Evaluate energies, forces and factors of contact at the limited iterate."""
-        q, islands = self.newton.q, self.newton.islands
         if self.has_friction:
-            self.terms.evaluate(q, self.rate, iterates=(islands.energy_buffer, islands.iteration))
+            self.terms.evaluate(iterates.q, self.rate, iterates=(islands.energy_buffer, islands.iteration))
         else:
-            self.terms.evaluate(q)
+            self.terms.evaluate(iterates.q)
 
-    def account(self, change: wp.array, noise: wp.array) -> None:
+    def account(self, norms, islands) -> None:
         """Add the energy change of contact to worlds, and the rounding floor."""
         inputs = [self.terms.energy, self.terms.gap, self._least, self.search.overflow]
-        inputs += [self.newton.islands.arrays[0], self._kept, change, noise]
+        inputs += [islands.arrays[0], self._kept, norms.of_worlds[0], norms.of_worlds[1]]
         self._launch(self._account, self.coupled.worlds, inputs, [])
 
     @timer("contact")
-    def assemble(self) -> None:
+    def assemble(self, iterates, islands) -> None:
         """Prepare the data that products and the preconditioner take from the last evaluation."""
-        newton = self.newton
         outputs = [self._curved, self._projected]
-        self._launch(self._find_curved, self.coupled.worlds, [newton.islands.arrays[0], self._late], outputs)
-        self.terms.meet()
-        if self.bends:
-            self.terms.prepare(newton.q, self._curved)
-        if self._bands:
-            self.terms.join()
+        self._launch(self._find_curved, self.coupled.worlds, [islands.arrays[0], self._late], outputs)
+        self.hessian.linearise(iterates.q, self._curved if self.bends else None)
+        self.hessian.assemble()
 
-    @timer("contact")
-    def join(self) -> None:
-        """Add contact to the preconditioner, once both are assembled."""
-        if self._bands:
-            self._bands(self.terms, self.newton.islands.arrays[0])
-
-    def direct(self) -> None:
-        """Compute directions by conjugate gradients, remaining motion included."""
-        wp.capture_if(self._going, self._approach)
-        self.newton.krylov.solve()
-        wp.capture_if(self._going, self._follow)
-
-    def _approach(self) -> None:
+    def approach(self, iterates, system) -> None:
         """Subtract the resistance of contact against the remaining motion from the residual."""
-        newton, blocks = self.newton, self.coupled.blocks
-        busy = newton.islands.needs_direction
-        self._sweep(self._find_way, [newton.q, self.bound, busy, blocks], [self._way])
+        wp.capture_if(self._going, lambda: self._approach(iterates, system))
+
+    def _approach(self, iterates, system) -> None:
+        blocks, fixed, wanted = self.coupled.blocks, system.masks.fixed, system.wanted
+        self._sweep(self._find_way, [iterates.q, iterates.proposed, wanted, blocks], [self._way])
         if len(self._nodes):
-            inputs = [self._nodes, self._aims, newton.q, newton.fixed, busy, blocks]
+            inputs = [self._nodes, self._aims, iterates.q, fixed, wanted, blocks]
             self._launch(self._push, (len(self._nodes), self.coupled.worlds), inputs, [self._way])
         self._pushed.zero_()
         self.terms.product(self._way, self._pushed)
-        self._sweep(self._lessen, [self._pushed, newton.fixed, busy, blocks], [newton.rhs])
+        self._sweep(self._lessen, [self._pushed, fixed, wanted, blocks], [system.rhs])
 
-    def _follow(self) -> None:
-        newton = self.newton
-        self._sweep(self._add, [self._way, newton.islands.needs_direction, self.coupled.blocks], [newton.direction])
-
-    def spread(self, p: wp.array) -> None:
-        """Write the contributions of pairs to H p."""
-        self.terms.place(p, self.newton.q, self._curved if self.bends else None)
-
-    def settle(self, p: wp.array, product: wp.array) -> None:
-        """Add the contributions of pairs to the product, and write p . H p block by block."""
-        newton = self.newton
-        self.terms.settle(p, product, newton.inactive_mask, newton.islands.needs_direction, newton.krylov_dots)
+    def follow(self, system) -> None:
+        """Add the remaining motion to the directions."""
+        inputs, outputs = [self._way, system.wanted, self.coupled.blocks], [system.direction]
+        wp.capture_if(self._going, lambda: self._sweep(self._add, inputs, outputs))
 
     @timer("CCD filter")
-    def hold(self) -> None:
+    def hold(self, iterates, search, system, islands) -> None:
         """Limit the trial step by CCD, and write its predicted decrease."""
-        newton = self.newton
-        self._launch(self._find_modes, self.coupled.worlds, [newton.islands.arrays[0]], [self._modes, self._longest])
-        self._launch(self._depart, self.coupled.worlds, [self._modes], [newton.islands.arrays[0]])
+        worlds, blocks, flags = self.coupled.worlds, self.coupled.blocks, islands.arrays[0]
+        self._launch(self._find_modes, worlds, [flags], [self._modes, self._longest])
+        self._launch(self._depart, worlds, [self._modes], [flags])
         if len(self._nodes):
-            inputs = [self._nodes, self._aims, newton.fixed, self._modes, *newton.islands.arrays, self.coupled.blocks]
-            self._launch(self._land, (len(self._nodes), self.coupled.worlds), inputs, [newton.q])
-        self._cut()
-        self._let_go()
-        inputs = [newton.rhs, newton.q, newton.base, self._modes, self.coupled.blocks]
-        self._sweep(self._differ_gain, inputs, [newton.dots])
-        self._sum(newton.dots, self._gain)
+            inputs = [self._nodes, self._aims, system.masks.fixed, self._modes, *islands.arrays, blocks]
+            self._launch(self._land, (len(self._nodes), worlds), inputs, [iterates.q])
+        self._cut(iterates, system, islands)
+        self._let_go(iterates, islands)
+        self._sweep(self._differ_gain, [system.rhs, iterates.q, iterates.base, self._modes, blocks], [self._dots])
+        self._sum(self._dots, self._gain)
         inputs = [self._modes, self.search.time, self._gain]
-        outputs = [*newton.islands.arrays, newton.stalled, self._projected]
-        self._launch(self._expect, self.coupled.worlds, inputs, outputs)
+        self._launch(self._expect, worlds, inputs, [*islands.arrays, search.stalled, self._projected])
 
-    def _cut(self) -> None:
-        """Limit the proposed motion by CCD; `bound` keeps the proposed target."""
-        newton = self.newton
-        far = FAR * self.search.margin
-        inputs = [newton.q, newton.base, self._unit, self.coupled.host.nodes, far, self.coupled.blocks]
-        self._sweep(self._stay, inputs, [self._move, self._modes, self.bound, self._longest])
+    def _cut(self, iterates, system, islands) -> None:
+        """Limit the proposed motion by CCD; `ahead` keeps the proposed target."""
+        q, blocks, far = iterates.q, self.coupled.blocks, FAR * self.search.margin
+        inputs = [q, iterates.base, self._unit, self.coupled.host.nodes, far, blocks]
+        self._sweep(self._stay, inputs, [self._move, self._modes, iterates.proposed, self._longest])
         shorter = [self._modes, self._longest, self.farthest]
         if self.farthest < math.inf:
-            self._sweep(self._near, [self._move, self._unit, *shorter, self.coupled.blocks], [newton.q])
-        self.search.filter(self._move, newton.q, self._unit, self._modes, self._units, self.touch.keep)
+            self._sweep(self._near, [self._move, self._unit, *shorter, blocks], [q])
+        self.search.filter(self._move, q, self._unit, self._modes, self._units, self.touch.keep)
         if self.farthest < math.inf:
             self._launch(self._less, self.coupled.worlds, shorter, [self.search.time])
         if len(self._nodes):
-            eps = ROUNDING * newton.eps
-            inputs = [self._nodes, self._aims, newton.fixed, self._modes, eps, self.coupled.blocks, newton.q]
-            self._launch(self._arrive, (len(self._nodes), self.coupled.worlds), inputs, [newton.islands.arrays[0]])
+            inputs = [self._nodes, self._aims, system.masks.fixed, self._modes, ROUNDING * self._eps, blocks, q]
+            self._launch(self._arrive, (len(self._nodes), self.coupled.worlds), inputs, [islands.arrays[0]])
 
     def share(self, before: np.ndarray, after: np.ndarray) -> float:
         """Return the CCD step fraction of a motion (3 W N,) that all worlds have in common. Not in a capture."""
-        base = wp.array(before.reshape(-1, 3), dtype=self.coupled.vector, device=self.newton.device)
+        base = wp.array(before.reshape(-1, 3), dtype=self.coupled.vector, device=self.coupled.device)
         self._modes.fill_(kernels.SINGLE_FRACTION)
         move = after - before
         longest = float(np.abs(move).max())
@@ -309,26 +264,25 @@ class NewtonContact:
         while True:
             fraction = min(1.0, self.farthest / longest) if longest > 0.0 else 1.0
             q = wp.array(
-                (before + fraction * move).reshape(-1, 3), dtype=self.coupled.vector, device=self.newton.device
+                (before + fraction * move).reshape(-1, 3), dtype=self.coupled.vector, device=self.coupled.device
             )
             self.search.filter(base, q, self._unit, self._modes, self._units, self.touch.keep)
             if not self.search.fit(base, lambda: self._shorten(longest)):  # else the filter moved nothing
                 return fraction * float(self.search.time.numpy().min())
 
-    def _let_go(self) -> None:
+    def _let_go(self, iterates, islands) -> None:
         """Reset the target to the iterate in worlds without pending motion."""
         self._going.zero_()
-        inputs = [self.newton.q, self.newton.islands.arrays[0], self.coupled.blocks]
-        self._sweep(self._part, inputs, [self.bound, self._going])
+        inputs = [iterates.q, islands.arrays[0], self.coupled.blocks]
+        self._sweep(self._part, inputs, [iterates.proposed, self._going])
 
     @timer("interpenetration check")
-    def finish(self, before: wp.array) -> None:
+    def finish(self, before: wp.array, iterates, islands) -> None:
         """Refuse substeps with interpenetration."""
-        newton = self.newton
-        self.search.check_crossings(before, newton.q)
-        inputs = [self.search.crossed, self.terms.gap, self.search.overflow, *newton.islands.arrays]
+        self.search.check_crossings(before, iterates.q)
+        inputs = [self.search.crossed, self.terms.gap, self.search.overflow, *islands.arrays]
         self._launch(self._refuse, self.coupled.worlds, inputs, [self.crossed, self.least])
-        self.tally(newton.islands.arrays[0])
+        self.tally(islands.arrays[0])
 
     def statistics(self) -> dict:
         """Return the statistics of all steps so far, by name.
@@ -443,9 +397,8 @@ class NewtonContact:
         return grown
 
     def _sweep(self, kernel, inputs: list, outputs: list) -> None:
-        device_arrays.sweep(
-            kernel, self.coupled.blocks, inputs, outputs, self.newton.device, worlds=self.coupled.worlds
-        )
+        coupled = self.coupled
+        device_arrays.sweep(kernel, coupled.blocks, inputs, outputs, coupled.device, worlds=coupled.worlds)
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim, inputs, outputs, device=self.newton.device)
+        wp.launch(kernel, dim, inputs, outputs, device=self.coupled.device)

@@ -1,43 +1,42 @@
 """Newton's method on the coupled system by preconditioned conjugate gradients; one device-side loop a world."""
 
-import math
-from functools import cached_property, partial
+from functools import partial
 
 import numpy as np
 import warp as wp
 
 from ddg_warp import device_arrays
-from ddg_warp.compile.residual_tolerance import outer_forces
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core.islands import Islands
-from ddg_warp.kernels.elements import element_path
-from ddg_warp.kernels.elements.coupled_element import coupled_storage
-from ddg_warp.kernels.forces.drag import block_inertia
 from ddg_warp.kernels.linear import rod_pcg
-from ddg_warp.kernels.linear.rod_dof_map import splits
-from ddg_warp.kernels.newton import coupled_newton
-from ddg_warp.solve.linear.pcg import SPARE, NewtonPCG, natural_scale
+from ddg_warp.solve.linear.linear_system import LinearSystem
+from ddg_warp.solve.linear.pcg import NewtonPCG, natural_scale
 from ddg_warp.solve.linear.rod_substructuring import RodSubstructuring
 from ddg_warp.solve.linear.skew_supports import SkewSupports
 from ddg_warp.solve.linear.sparse_system import MatrixAssembly, SparseSystem, Sums
 from ddg_warp.solve.newton.contact_newton import NewtonContact
+from ddg_warp.solve.newton.coupled_state import Iterates, Loading, ResidualNorms, SearchState
 from ddg_warp.solve.newton.edge_rotation import EdgeRotations
+from ddg_warp.solve.newton.element_evaluation import ElementEvaluation
 from ddg_warp.solve.newton.frozen_hessian import FrozenHessian
+from ddg_warp.solve.newton.line_search import LineSearch
 from ddg_warp.solve.newton.relaxed_convergence import RelaxedConvergence
 from ddg_warp.solve.newton.residual import ResidualAssembler
 from ddg_warp.solve.newton.residual_tolerance import ResidualTolerances
-from ddg_warp.solve.newton.rod_newton import FIRST_EXACT_ITERATION, FROZEN, FROZEN_ONLY, NewtonOptions
+from ddg_warp.solve.newton.rod_newton import FROZEN, FROZEN_ONLY, NewtonOptions
 from ddg_warp.solve.newton.sleeping_islands import SleepingIslands
 from ddg_warp.timers import timer
 
 PRECONDITIONERS = ("block_jacobi", "chain", "multilevel", "chain_multilevel")
 STRAIGHT = 1e-9  # rest turning angle between edges that may be rounding [rad]
 RESCALED = 2.0**12  # change of the natural scale that conjugate gradients tolerate
-LOOSEST = 0.1  # largest forcing term (Eisenstat and Walker): relative tolerance of a direction
 
 
 class CoupledNewton:
-    """Newton's method on all worlds of the coupled system, with the buffers of a solve. Attributes: see also `RodNewton`.
+    """Newton's method on all worlds of the coupled system, one loop a world.
+
+    The state of a solve is in `islands`, `iterates`, `loading`, `norms`, `search_state` and `system`. All other attributes are
+    solver components, which get the state that they read and write as arguments.
 
     Args:
         preconditioner: of conjugate gradients: "block_jacobi", "chain" (substructuring, see `kernels.linear.rod_substructuring`),
@@ -48,7 +47,9 @@ class CoupledNewton:
         split: True if edges may be stiffer than the matrix carries, where possible; see `RodSubstructuring.splits`.
 
     Attributes:
-        inactive_mask: (W N,) bits of dofs that a direction leaves unchanged: fixed dofs and, in contact, dofs of sleeping islands.
+        `sparsity`, `chains`: `SparseSystem` and, with substructuring, `RodSubstructuring`.
+        `frozen`, `planes`, `turns`, `contact`, `sleeping`, `relaxed`: components that not all models and options need, or None.
+        krylov: conjugate gradients; None if substructuring is exact.
     """
 
     banded = True  # True if substructuring stores its blocks of H, which are valid on free dofs alone
@@ -69,114 +70,82 @@ class CoupledNewton:
             raise SceneError(
                 f"preconditioner {preconditioner!r}: for a coupled system it is one of {', '.join(PRECONDITIONERS)}"
             )
-        coupled = model.coupled
-        self.coupled, self.options, self.device = coupled, options, coupled.device
-        self.real, self.linear = model.types.real, linear or model.types.linear
-        self.eps = model.types.eps
-        worlds, blocks, host, device = coupled.worlds, coupled.blocks, coupled.host, coupled.device
-        serial = device_arrays.serial(device)
-        self.worlds, self.all = worlds, worlds * blocks
-        V, H = coupled.vector, wp.types.vector(3, self.linear)
-        self.chains = RodSubstructuring.of(coupled, preconditioner, self.banded, split)
-        self.system = SparseSystem(coupled, self.chains and self.chains.kept)
-
-        def make(shape, dtype):
-            return wp.zeros(shape, dtype=dtype, device=device)
-
-        self.q, self.base, self.target = (make(self.all, V) for _ in range(3))
-        self.load = wp.array(np.tile(host.constant_loads(), (worlds, 1)), dtype=V, device=device)
-        self._weights, self._weight = make((3, worlds, blocks), self.real), make((3, worlds), self.real)
-        self.change, self.noise, self.square = (self._weights[i] for i in range(3))
-        self.dots = make((worlds, device_arrays.takers(blocks, device)), self.real)
-        self.mass = make((worlds, blocks), block_inertia(self.real)) if drag else coupled.mass
-        bits = (host.fixed * [1, 2, 4]).sum(1).astype(np.uint8)
-        self.fixed = wp.array(bits, dtype=wp.uint8, device=device)
-        self.held = self.fixed  # spatial components, for predictors: rates along skew supports stay in their planes
-        self.planes = SkewSupports(coupled, self.system, self.real, self.linear) if host.frames else None
-        self.inactive_mask = wp.array(np.tile(bits, worlds), dtype=wp.uint8, device=device)
-        if self.planes:
-            bits[list(host.frames)] = 0
-            self.held = wp.array(bits, dtype=wp.uint8, device=device)
-        gravity = np.asarray(model.scene.gravity, float)
-        self.gravity = wp.array(gravity[None], dtype=V, device=device)
-        self.rhs, self.direction = (make(self.all, H) for _ in range(2))
-        self.matrix = make((9, worlds * self.system.positions), self.linear)
-        self.krylov_dots = make((worlds, blocks), self.linear)
-        self.islands = Islands(worlds, self.real, device)
-        self.iterations, self.stalled = (make(worlds, int) for _ in range(2))
-        self.best, self.decrease, self.turn, self.worst, self.goal, self.limit = (
-            make(worlds, self.real) for _ in range(6)
-        )
-        self.goal.fill_(math.inf)
-        self.forcing = make(worlds, self.linear)
-        self.pcg_work = make(1, wp.int64)
+        self.coupled = coupled = model.coupled
+        self.options, self.linear = options, linear or model.types.linear
+        host, real, self._eps = coupled.host, coupled.real, model.types.eps
+        if host.touching and reuse:
+            raise SceneError(
+                "contact: solver 'projective' keeps the matrix of a step, which contact changes; use 'newton'"
+            )
+        self.islands = Islands(coupled.worlds, real, coupled.device)
         self.frozen = FrozenHessian(self.islands) if reuse else None
         self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
         if self.psd == "none":
             self._require_exact()
-        self.contact = NewtonContact(self, model) if host.touching else None
-        exact = [self.psd != "gauss_newton" and part.term.measure.packed > 0 for part in coupled.sets]
-        self.exact_from = tuple(
-            (0 if self.psd == "none" else FIRST_EXACT_ITERATION) if wanted else None for wanted in exact
-        )
+
+        self.chains = RodSubstructuring.of(coupled, preconditioner, self.banded, split)
+        self.sparsity = SparseSystem(coupled, self.chains and self.chains.kept)
+        self.planes = SkewSupports(coupled, self.sparsity, real, self.linear) if host.frames else None
         banded = self.chains is not None and self.chains.banded
-        self.local = tuple(
-            banded and part.host.along for part in coupled.sets
-        )  # True if derivatives are of the local dofs
-        self.split = tuple(
-            split and is_local and splits(part.term) for is_local, part in zip(self.local, coupled.sets, strict=True)
-        )
-        sets = zip(coupled.sets, exact, self.local, self.split, strict=True)
-        self.parts = [self._part(*inputs, make, H) for inputs in sets]
-        ends = host.edges
-        self.ends = wp.array(np.ascontiguousarray(ends, np.int32), dtype=int, device=device)
-        # curvature is linear in the angles of mesh edges: no cap, which would shorten the steps of all other dofs
-        capless = np.concatenate([np.zeros(0, int), *(shell.edges for shell in host.shells)])
-        spins = np.arange(host.nodes, blocks)
-        spins = spins[~np.isin(spins, capless)]
-        self.spins = wp.array(spins.astype(np.int32), dtype=int, device=device)
-        turning = device_arrays.takers(len(ends) + len(spins), device)
-        self.squares = make((worlds, turning), self.real)
-        self._sum = Sums(worlds, self.dots.shape[1], self.real, device)
-        self._sum_weights = Sums(3 * worlds, blocks, self.real, device)
-        self._largest = Sums(worlds, turning, self.real, device, largest=True)
-        lengths = host.edge_lengths
-        self.arm, self.longest = float(lengths.mean()), float(lengths.max())
-        self._evaluate = [
-            element_path.evaluate_kernel(
-                coupled_storage(part.term, self.real, not local, serial), self.real, self.linear, iteration, is_split
-            )
-            for part, iteration, local, is_split in zip(
-                coupled.sets, self.exact_from, self.local, self.split, strict=True
-            )
-        ]
+        self.elements = ElementEvaluation(coupled, self.psd, self.linear, banded, split)
+        matrix = self.sparsity, self.elements.outputs, real, self.linear, self.elements.exact_from
+        self._assembly = MatrixAssembly(coupled, *matrix, self.elements.local, drag)
         if self.chains:
-            self.chains.bind(self.system, self.parts, self.real, self.linear, self.exact_from, drag, reuse)
-            if self.contact:
-                self.contact.bind(self.chains)
-        self._direct = self.chains is not None and self.chains.exact
+            self.chains.bind(*matrix, drag, reuse)
+        self.iterates, self.norms = Iterates.of(coupled), ResidualNorms.of(coupled)
+        self.search_state, self.tolerances = SearchState.of(coupled), ResidualTolerances(coupled, real, self.linear)
+        self.loading = Loading.of(coupled, model.scene.gravity, drag, self.tolerances)
+        self.contact = None
+        if host.touching:
+            self.contact = NewtonContact(model, self.iterates, self.islands.inverse_step, self.linear, self.psd)
+            if self.chains:
+                self.contact.hessian.bind(self.chains)
+        self.exact = self.chains is not None and self.chains.exact
         fails = self.psd == "none"
-        curved = any(exact) or (self.contact is not None and self.contact.bends)
-        repeats = not reuse and (fails or curved or self._direct)
-        self._repeat = rod_pcg.repeat_kernel(self.real, fails, curved) if repeats else None
-        self.negative = make(worlds, int)
-        self._assembly = MatrixAssembly(
-            coupled, self.system, self.parts, self.real, self.linear, self.exact_from, self.local, drag
+        curved = any(first is not None for first in self.elements.exact_from) or bool(
+            self.contact and self.contact.bends
         )
-        self.turns = EdgeRotations(self) if host.rods else None
+        repeats = not reuse and (fails or curved or self.exact)
+        self._repeat = rod_pcg.repeat_kernel(real, fails, curved) if repeats else None
+        # flags of indefiniteness: repeat the iterate, or drop compression in the next one
+        self.system = LinearSystem.of(
+            coupled,
+            self.sparsity,
+            self.chains,
+            self.linear,
+            self.islands.needs_direction,
+            self.updated_islands.needs_direction,
+            None if repeats or self.exact else self.islands.drop_compression,
+        )
+        self._residual = ResidualAssembler(
+            coupled,
+            self.elements,
+            self.sparsity,
+            self.chains,
+            self.planes,
+            self.tolerances,
+            self.contact and self.contact.terms,
+            self.linear,
+            options.rtol,
+            options.floor_factor * self._eps,
+            drag,
+        )
         most = int(options.unconverged_fraction * self.contact.touching_bodies) if self.contact else 0
-        self._judge, self._measure, self._rotate, self._take, self._move = coupled_newton.search_kernels(
-            self.real, self.linear, serial, bool(host.rods), bool(coupled.edges), self.contact is not None, most > 0
-        )
-        self.allowed = ResidualTolerances(coupled, self.real, self.linear)
-        outer = outer_forces(host, gravity)
-        self.outer = self.allowed.assign(self.allowed.bodies.loads(outer)[None])
-        self.resting = SleepingIslands(self, *self.contact.bodies) if self.contact else None
-        self.unconverged_fraction = RelaxedConvergence(self, most) if most else None
-        self.here = self.contact.bound if self.contact else self.q
-        self._balance = ResidualAssembler(self, drag)
-        self._worst = Sums(worlds, self.allowed.ratio.shape[1], self.real, device, largest=True)
-        self._multilevel = preconditioner in ("multilevel", "chain_multilevel")
+        self.line_search = LineSearch(coupled, self.linear, most > 0)
+        self._worst = Sums(coupled.worlds, self.tolerances.ratio.shape[1], real, coupled.device, largest=True)
+        lengthened = self.chains if any(self.elements.split) else None
+        self.turns = EdgeRotations(coupled, self.linear, lengthened) if host.rods else None
+        self.sleeping = self.relaxed = self.krylov = None
+        if self.contact:
+            tolerances, bodies = self.tolerances, self.contact.bodies
+            self.sleeping = SleepingIslands(coupled, self.linear, tolerances, self.chains, *bodies)
+        if most:
+            self.relaxed = RelaxedConvergence(coupled, self.sleeping, most)
+        if not self.exact:
+            parts = self.sparsity, self.chains, self.contact and self.contact.hessian
+            multilevel = preconditioner in ("multilevel", "chain_multilevel")
+            stop = self.tolerances, options.rtol, self.relaxed
+            self.krylov = NewtonPCG(coupled, *parts, self.linear, multilevel, *stop)
 
     def _require_exact(self) -> None:
         """Refuse the exact Hessian for measures without second derivatives."""
@@ -207,40 +176,26 @@ class CoupledNewton:
         """
         if self.options.psd == "auto" and self.psd != self.automatic_psd():
             return True
-        return not 1.0 / RESCALED < natural_scale(self.coupled) / self.krylov.scale < RESCALED
+        rescaled = natural_scale(self.coupled) / self.krylov.scale if self.krylov else 1.0
+        return not 1.0 / RESCALED < rescaled < RESCALED
 
-    def _part(self, part, exact: bool, local: bool, split: bool, make, H) -> dict:
-        """Return the output arrays of an element set."""
-        measure, count = part.term.measure, self.worlds * part.elements
-        rows, factor, gradient = (
-            (measure.size, self.linear, self.real) if local else (measure.slots, H, self.coupled.vector)
-        )
-
-        def lay(rows, dtype):
-            return device_arrays.allocate((rows, count), dtype, self.device)
-
-        return {
-            "factor": lay(len(measure.strains) * rows, factor),
-            "tension": lay(max(1, measure.tensions) + split, self.linear),
-            "second": lay(measure.packed, self.linear) if exact else make((1, 1), self.linear),
-            "gradient": lay(rows, gradient),
-            "energy": lay(2, self.real),
-            "stiffness": make(count, self.linear),
-        }
+    @property
+    def updated_islands(self) -> Islands | FrozenHessian:
+        """Islands with a new matrix."""
+        return self.frozen or self.islands
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        result = [*self._balance.kernels, self._judge, self._measure, self._rotate, self._take]
-        result += [*self.allowed.kernels, *([self._repeat] if self._repeat else [])]
-        used = (self.chains, None if self._direct else self.krylov, self.planes, self.turns, self.contact, self.resting)
-        used += (self.unconverged_fraction,)
-        parts = [self._move, *self.coupled.carries, *(k for part in used if part for k in part.kernels)]
-        evaluate = [(kernel, 128) for kernel in self._evaluate]
-        sums = (self._sum, self._sum_weights, self._largest, self._worst)
-        sums = [kernel for part in sums for kernel in part.kernels]
-        result += self.frozen.kernels if self.frozen else []
-        return [*result, *evaluate, *self._assembly.kernels, *parts, *sums]
+        parts = (self._residual, self.tolerances, self.line_search, self._worst, self.elements, self._assembly)
+        parts += (self.frozen, self.chains, self.krylov, self.planes, self.turns, self.contact, self.sleeping)
+        kernels = [kernel for part in (*parts, self.relaxed) if part for kernel in part.kernels]
+        return [*kernels, *self.coupled.carries, *([self._repeat] if self._repeat else [])]
+
+    @property
+    def pcg_work(self) -> wp.array:
+        """Iterations of all solves so far (1,)."""
+        return self.search_state.pcg_work
 
     def pcg_iterations(self) -> int:
         """Return the iterations of all solves so far."""
@@ -250,9 +205,9 @@ class CoupledNewton:
     def solve(self, state) -> None:
         """Iterate until no world is active, with the lagged data of `state`; can be captured."""
         if self.frozen:
-            self.frozen.begin()
-        if self.resting:
-            self.resting.wake()
+            self.frozen.begin(self.islands)
+        if self.sleeping:
+            self.sleeping.wake(self.search_state, self.system, self.islands)
         wp.capture_while(self.islands.any_active, lambda: self.iterate(state))
 
     def iterate(self, state) -> None:
@@ -265,171 +220,109 @@ class CoupledNewton:
 
     def _step(self, state) -> None:
         """Advance active worlds to the next iterate."""
-        wp.capture_if(self.islands.any_needs_direction, self._aim)
-        self.move()
+        wp.capture_if(self.islands.any_needs_direction, self._find_direction)
+        self.line_search.move(self.iterates, self.system, self.islands)
         if self.turns:
-            wp.capture_if(self.islands.any_edge_rotation, lambda: self.turns.turn(state))
+            wp.capture_if(self.islands.any_edge_rotation, lambda: self._rotate(state))
         if self.contact:
-            self.contact.hold()
+            self.contact.hold(self.iterates, self.search_state, self.system, self.islands)
 
-    def _aim(self) -> None:
+    def _find_direction(self) -> None:
         """Compute search directions and step lengths of worlds that do not backtrack."""
-        if self.resting:
-            self.resting(self.contact.terms.products)
+        if self.sleeping:
+            products, ratio, rtol = self.contact.terms.products, self.tolerances.ratio, self.options.rtol
+            self.sleeping(products, ratio, rtol, self.search_state, self.system, self.islands)
         self.assemble()
         self.direct()
         self.take()
 
     @timer("evaluate")
     def evaluate(self, state) -> None:
-        """Evaluate energies, gradients and Gauss-Newton factors of all elements at the iterate, `here`."""
-        parts = [partial(self._evaluate_set, state, index) for index in range(len(self.coupled.sets))]
-        device_arrays.side_by_side([self.contact.evaluate, *parts] if self.contact else parts, self.device)
-
-    def _evaluate_set(self, state, index: int) -> None:
-        results = element_path.results_type(self.real, self.linear, not self.local[index])()
-        for name, values in self.parts[index].items():
-            setattr(results, name, values)
-        wp.launch(
-            self._evaluate[index],
-            (self.worlds, device_arrays.takers(self.coupled.sets[index].elements, self.device)),
-            [self.coupled.elements(state, index, self.here, self.islands.inverse_step), *self.islands.arrays],
-            [results],
-            device=self.device,
-            block_dim=128,
-        )
+        """Evaluate energies, gradients and Gauss-Newton factors of all elements and of contact at the iterate."""
+        launches = self.elements.launches(state, self.iterates.proposed, self.islands)
+        if self.contact:
+            launches.insert(0, partial(self.contact.evaluate, self.iterates, self.islands))
+        device_arrays.side_by_side(launches, self.coupled.device)
 
     @timer("residual")
     def balance(self) -> None:
         """Compute residuals, the change of the energy, and the worlds that are out of equilibrium."""
-        islands = self.islands
-        self._balance()
+        system, islands = self.system, self.islands
+        self._residual(self.iterates, self.loading, self.norms, system, islands)
         flags = islands.not_converged, islands.below_rounding_floor
-        self.allowed.sum_up(self.rhs, self.options.rtol, islands, *flags, self._direct and not self.frozen)
+        self.tolerances.sum_up(system.rhs, self.options.rtol, islands, *flags, self.exact and not self.frozen)
 
     @timer("line search")
     def judge(self) -> None:
         """Stop worlds, reject their iterates, or request a direction."""
-        options = self.options
-        weights = self._weights.reshape((3 * self.worlds, -1)), self._weight.flatten()
-        sums = [partial(self._sum_weights, *weights), partial(self._worst, self.allowed.ratio, self.worst)]
-        counts = [partial(self.unconverged_fraction.count, options.rtol)] if self.unconverged_fraction else []
-        device_arrays.side_by_side([*sums, *counts], self.device)
-        if self.unconverged_fraction:
-            self.unconverged_fraction.excuse()
+        norms, islands, ratio, rtol = self.norms, self.islands, self.tolerances.ratio, self.options.rtol
+        sums = [partial(self.line_search.sum_norms, norms), partial(self._worst, ratio, norms.worst)]
+        if self.relaxed:
+            sums.append(partial(self.relaxed.count, rtol, ratio, islands))
+        device_arrays.side_by_side(sums, self.coupled.device)
+        if self.relaxed:
+            self.relaxed.excuse(rtol, norms, islands)
         if self.contact:
-            self.contact.account(self._weight[0], self._weight[1])
-        wp.launch(
-            self._judge,
-            self.worlds,
-            [*(self._weight[i] for i in range(3)), self.worst, options.rtol]
-            + [options.floor_factor * self.eps]
-            + [options.max_iterations, options.max_halvings, LOOSEST, options.linear_rtol, SPARE]
-            + [*self.islands.arrays, self.best, self.stalled, self.forcing, self.goal, self.limit],
-            device=self.device,
-        )
+            self.contact.account(norms, islands)
+        self.line_search.judge(norms, self.search_state, self.system, islands, self.options, self._eps)
 
     @timer("assemble")
     def assemble(self) -> None:
         """Assemble H of the worlds that need a direction."""
         if self.frozen:
-            self.frozen.update()
+            self.frozen.update(self.islands)
         if not self.contact:
-            self._assemble_own()
+            self._assemble_elements()
             return
-        device_arrays.side_by_side([self._assemble_own, self.contact.assemble], self.device)
-        self.contact.join()
+        contact = partial(self.contact.assemble, self.iterates, self.islands)
+        device_arrays.side_by_side([self._assemble_elements, contact], self.coupled.device)
+        self.contact.hessian.add_to_bands(self.islands.arrays[0])
 
-    def _assemble_own(self) -> None:
-        updated_islands = self.anew
-        self._assembly(self.mass, updated_islands, self.matrix)
+    def _assemble_elements(self) -> None:
+        matrix, mass, updated_islands = self.system.matrix, self.loading.mass, self.updated_islands
+        self._assembly(mass, updated_islands, matrix)
         if self.planes:
-            self.planes.matrix(self.matrix, updated_islands.needs_direction)
-        if self.chains and not self._direct:
-            self.chains.assemble(self.matrix, self.mass, updated_islands)
+            self.planes.matrix(matrix, updated_islands.needs_direction)
+        if self.chains and not self.exact:
+            self.chains.assemble(matrix, mass, updated_islands)
 
     @timer("direction")
     def direct(self) -> None:
         """Compute directions: by elimination if exact, otherwise by conjugate gradients."""
-        if self._direct:
-            self.negative.zero_()
-            self.forcing.zero_()  # only rounding is left
-            self.chains.direct(
-                self.matrix,
-                self.mass,
-                self.islands,
-                self.anew,
-                self.fixed,
-                self.inactive_mask,
-                self.rhs,
-                self.negative,
-                self.direction,
-                self.krylov_dots,
-            )
-        elif self.contact:
-            self.contact.direct()
+        system, islands = self.system, self.islands
+        if self.exact:
+            system.indefinite.zero_()
+            system.forcing.zero_()  # only rounding is left
+            self.chains.direct(system, self.loading.mass, islands, self.updated_islands)
         else:
-            self.krylov.solve()
+            if self.contact:
+                self.contact.approach(self.iterates, system)
+            self.krylov.solve(system, islands, self.after_cycle)
+            if self.contact:
+                self.contact.follow(system)
         if self._repeat:  # repeat indefinite iterates without second derivatives and compression
-            wp.launch(self._repeat, self.worlds, [1, *self.islands.arrays, self.negative], device=self.device)
+            inputs = [1, *islands.arrays, system.indefinite]
+            wp.launch(self._repeat, self.coupled.worlds, inputs, device=self.coupled.device)
 
-    @cached_property
-    def krylov(self) -> NewtonPCG:
-        """Solver of directions if elimination is not exact."""
-        return NewtonPCG(self, self._multilevel)
-
-    @property
-    def anew(self) -> Islands | FrozenHessian:
-        """Islands with a new matrix."""
-        return self.frozen or self.islands
-
-    @property
-    def indefinite(self) -> wp.array:
-        """Target of conjugate gradients' flags of indefiniteness: repeat the iterate, or drop compression in the next one."""
-        return self.negative if self._repeat else self.islands.drop_compression
-
-    def watch(self) -> None:
+    def after_cycle(self) -> None:
         """Do nothing: hook that runs after every iteration of conjugate gradients."""
 
     @timer("step length")
     def take(self) -> None:
         """Compute the step lengths along the directions."""
-        blocks = self.coupled.blocks
-        inputs = [self.rhs, self.direction, self.islands.needs_direction, blocks]
-        device_arrays.sweep(self._measure, blocks, inputs, [self.dots], self.device, worlds=self.worlds)
-        self._sum(self.dots, self.decrease)
-        self.measure_turns()
-        wp.launch(
-            self._take,
-            self.worlds,
-            [self.decrease, self.turn, self.options.rotation_cap, self.iterations],
-            [*self.islands.arrays, self.stalled, self.pcg_work],
-            device=self.device,
-        )
+        self.line_search.predict_decrease(self.search_state, self.system)
+        self.measure_rotation()
+        self.line_search.take(self.search_state, self.system, self.islands, self.options.rotation_cap)
 
-    def measure_turns(self) -> None:
+    def measure_rotation(self) -> None:
         """Compute the largest squared rotation of the directions, transformed to spatial components."""
         if self.planes:
-            self.planes.back(self.direction, self.islands.needs_direction)
-        device_arrays.sweep(
-            self._rotate,
-            len(self.ends) + len(self.spins),
-            [self.q, self.direction, self.ends, self.spins, self.islands.needs_direction, self.coupled.blocks],
-            [self.squares],
-            self.device,
-            worlds=self.worlds,
-        )
-        self._largest(self.squares, self.turn)
+            self.planes.back(self.system.direction, self.system.wanted)
+        self.line_search.measure_rotation(self.iterates, self.search_state, self.system)
 
-    @timer("update")
-    def move(self) -> None:
-        """Move the iterates by the step, or by the fraction that the line search has left."""
-        islands = self.islands
-        device_arrays.sweep(
-            self._move,
-            self.coupled.blocks,
-            [self.direction, islands.step_length, islands.iterate_action, islands.backtracks, self.coupled.blocks],
-            [self.base, self.q],
-            self.device,
-            worlds=self.worlds,
-        )
+    @timer("edge rotation")
+    def _rotate(self, state) -> None:
+        """Position the nodes of rods with edge rotations, and update the frames of `state` where required."""
+        self.turns.place(self.iterates, self.system, self.islands)
+        if self.coupled.edges:
+            self.coupled.renew(state, self.iterates.q, self.islands.iterate_action)

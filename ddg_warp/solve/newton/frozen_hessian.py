@@ -16,18 +16,17 @@ class FrozenHessian:
     """
 
     def __init__(self, islands: Islands):
-        self._islands = islands
         self._flags, scalars = wp.zeros_like(islands.arrays[0]), islands.arrays[1]
         self.arrays, self.needs_direction = [self._flags, scalars], self._flags[NEEDS_DIRECTION]
         self._done = wp.zeros_like(islands.needs_direction)
         self.kernels = [freeze_kernel()]
 
-    def begin(self) -> None:
+    def begin(self, islands: Islands) -> None:
         """Discard the matrix of the last solve."""
         self._done.zero_()
-        self._islands.drop_compression.fill_(1)
+        islands.drop_compression.fill_(1)
 
-    def update(self) -> None:
+    def update(self, islands: Islands) -> None:
         """Find the worlds that need a direction and have no matrix yet; mark the matrix as made."""
-        wp.copy(self._flags, self._islands.arrays[0])
-        wp.launch(self.kernels[0], len(self._islands), [self._flags, self._done], device=self._flags.device)
+        wp.copy(self._flags, islands.arrays[0])
+        wp.launch(self.kernels[0], len(islands), [self._flags, self._done], device=self._flags.device)

@@ -14,35 +14,33 @@ from ddg_warp.kernels.newton.relaxed_convergence import outlier_kernels
 
 
 class RelaxedConvergence:
-    """Relaxed convergence of a `CoupledNewton` in contact; launches alone.
+    """Relaxed convergence of a `CoupledModel` in contact; launches alone.
 
     Args:
-        newton: with its `SleepingIslands`, which numbers the bodies.
+        sleeping: `SleepingIslands`, which number the bodies.
         most: unconverged bodies that a world may have.
 
     Attributes:
         most; number: (worlds,) unconverged bodies of the last `count`.
     """
 
-    def __init__(self, newton, most: int):
-        self.newton, self.most = newton, most
-        self._owner, self._bodies = newton.resting.owner, newton.resting.bodies
-        worlds, device = newton.worlds, newton.device
+    def __init__(self, coupled, sleeping, most: int):
+        self.coupled, self.most = coupled, most
+        self._owner, self._bodies = sleeping.owner, sleeping.bodies
+        worlds, device = coupled.worlds, coupled.device
         self._out_of_balance = wp.zeros(worlds * self._bodies, dtype=int, device=device)
         self.number = wp.zeros(worlds, dtype=int, device=device)
-        self._count, self._excuse = self.kernels = outlier_kernels(newton.real, device_arrays.serial(device))
+        self._count, self._excuse = self.kernels = outlier_kernels(coupled.real, device_arrays.serial(device))
 
-    def excuse(self) -> None:
+    def excuse(self, rtol: float, norms, islands) -> None:
         """Mark worlds with so few unconverged bodies as converged, by the counts and the largest residuals."""
-        newton = self.newton
-        inputs = [self.number, self.most, newton.worst, newton._weight[2], newton.options.rtol, *newton.islands.arrays]
-        wp.launch(self._excuse, newton.worlds, inputs, device=newton.device)
+        inputs = [self.number, self.most, norms.worst, norms.of_worlds[2], rtol, *islands.arrays]
+        wp.launch(self._excuse, self.coupled.worlds, inputs, device=self.coupled.device)
 
-    def count(self, rtol: float) -> None:
+    def count(self, rtol: float, ratio: wp.array, islands) -> None:
         """Count the bodies of active worlds with a residual ratio above a tolerance."""
-        newton = self.newton
         self._out_of_balance.zero_()
         self.number.zero_()
-        inputs = [newton.allowed.ratio, self._owner, self._bodies, rtol, *newton.islands.arrays]
+        coupled, inputs = self.coupled, [ratio, self._owner, self._bodies, rtol, *islands.arrays]
         outputs = [self._out_of_balance, self.number]
-        device_arrays.sweep(self._count, len(self._owner), inputs, outputs, newton.device, worlds=newton.worlds)
+        device_arrays.sweep(self._count, len(self._owner), inputs, outputs, coupled.device, worlds=coupled.worlds)

@@ -22,64 +22,60 @@ SLEEP = 0.1
 
 
 class SleepingIslands:
-    """Sleeping islands of a `CoupledNewton` in contact; writes `CoupledNewton.inactive_mask` and `RodSubstructuring.idle`.
+    """Sleeping islands of a `CoupledModel` in contact: masks of inactive dofs and rod paths, and excluded pairs.
 
     Args:
-        newton: with its contact and residual tolerances made.
+        linear: scalar type of products with pairs.
+        tolerances: `ResidualTolerances`; `chains`: `RodSubstructuring`, or None.
         body: body (rod, shell, or several joined) of each block (blocks,), -1 for none; bodies: largest possible number of bodies.
 
     Attributes:
-        owner: body of every ratio of `CoupledNewton.allowed`, -1 for none.
+        owner: body of every ratio of the tolerances, -1 for none.
     """
 
-    def __init__(self, newton, body: np.ndarray, bodies: int):
-        self.newton, coupled, device = newton, newton.coupled, newton.device
-        self._worlds, self.bodies = coupled.worlds, bodies
+    def __init__(self, coupled, linear, tolerances, chains, body: np.ndarray, bodies: int):
+        self._device, self._worlds, self.bodies = coupled.device, coupled.worlds, bodies
         owner = [body]
-        for level in newton.allowed.bodies.levels:  # sums over clusters belong to the body of their blocks
+        for level in tolerances.bodies.levels:  # sums over clusters belong to the body of their blocks
             owner.append(owner[-1][level.items[level.starts[:-1]]])
 
         def put(values):
-            return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
+            return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=coupled.device)
 
         self.owner, self._body = put(np.concatenate(owner)), put(body)
         self._link, self._awake = (put(np.arange(coupled.worlds * bodies)) for _ in range(2))
         self._any = put(np.zeros(coupled.worlds))
-        chains = newton.chains
-        self._where, self._idle, self._width = (
-            (chains.where, chains.idle, chains.width) if chains else (put([]), put([]), 1)
-        )
-        made = resting_kernels(newton.real, newton.linear, device_arrays.serial(device))
+        self._where, self._width = (chains.where, chains.width) if chains else (put([]), 1)
+        made = resting_kernels(coupled.real, linear, device_arrays.serial(coupled.device))
         self._begin, self._look, self._join, self._wake, self._settle, self._leave = self.kernels = made
 
     @timer("sleeping islands")
-    def __call__(self, products) -> None:
-        """Find sleeping islands by the residuals of the iterate and the pairs of a `PairProduct`."""
-        newton, device = self.newton, self.newton.device
+    def __call__(self, products, ratio: wp.array, rtol: float, search, system, islands) -> None:
+        """Find sleeping islands by ratios of residuals to tolerances, and the pairs of a `PairProduct`."""
+        device = self._device
         device_arrays.sweep(self._begin, len(self._link), [], [self._link, self._awake, self._any], device)
-        inputs = [newton.allowed.ratio, self.owner, self.bodies, SLEEP * newton.options.rtol, *newton.islands.arrays]
+        inputs = [ratio, self.owner, self.bodies, SLEEP * rtol, *islands.arrays]
         device_arrays.sweep(self._look, len(self.owner), inputs, [self._awake, self._any], device, worlds=self._worlds)
         inputs = [products.sets, self._body, self.bodies, self._awake]
         device_arrays.take_turns(self._join, products.most, inputs, [self._link], device)
         device_arrays.sweep(self._wake, len(self._link), [], [self._link, self._awake], device)
-        self._bar()
-        self.leave(products)
+        self._mask(search, system, islands)
+        self.leave(products, system)
 
-    def leave(self, products) -> None:
+    def leave(self, products, system) -> None:
         """Exclude pairs between sleeping bodies from products, among the present pairs."""
-        device_arrays.take_turns(
-            self._leave, products.most, [products.sets, self.newton.inactive_mask], [], self.newton.device
-        )
+        inputs = [products.sets, system.masks.inactive]
+        device_arrays.take_turns(self._leave, products.most, inputs, [], self._device)
 
-    def wake(self) -> None:
+    def wake(self, search, system, islands) -> None:
         """Wake all islands; see `leave` for the pairs."""
         self._any.zero_()
-        self._bar()
+        self._mask(search, system, islands)
 
-    def _bar(self) -> None:
-        newton = self.newton
-        self._idle.fill_(1)
-        inputs = [self._link, self._awake, self._any, self.bodies, newton.stalled, newton.islands.arrays[0]]
-        inputs += [self._body, newton.fixed, self._where, self._width]
-        outputs = [newton.inactive_mask, self._idle]
-        device_arrays.sweep(self._settle, len(self._body), inputs, outputs, newton.device, worlds=self._worlds)
+    def _mask(self, search, system, islands) -> None:
+        masks = system.masks
+        masks.idle_paths.fill_(1)
+        inputs = [self._link, self._awake, self._any, self.bodies, search.stalled, islands.arrays[0]]
+        inputs += [self._body, masks.fixed, self._where, self._width]
+        outputs = [masks.inactive, masks.idle_paths]
+        device_arrays.sweep(self._settle, len(self._body), inputs, outputs, self._device, worlds=self._worlds)

@@ -67,7 +67,7 @@ class CoupledStep(StepDriver):
         super().__init__(integrator, model, solver, means, counts_of)
         self.contact = solver.contact
         if counts_of is not None:
-            self.newton.pcg_work = counts_of.newton.pcg_work
+            self.newton.search_state.pcg_work = counts_of.newton.pcg_work
             if solver.contact:
                 solver.contact.go_on(counts_of.newton.contact)
         if solver.contact:
@@ -165,7 +165,7 @@ class CoupledStep(StepDriver):
             self._keep()
         else:
             self.integrator._worlds.take_part(self.alone.left, before, after, self.coupled.worlds)
-            wp.copy(self.newton.q, after.q)
+            wp.copy(self.newton.iterates.q, after.q)
             before = after
         self._try(before, after)
         wp.capture_while(self.remaining, lambda: self._try(after, after))
@@ -239,28 +239,31 @@ class CoupledStep(StepDriver):
     def predict(self, before):
         """Launch the predictor, with supports at their prescribed positions; return the state of `_start_frames`."""
         coupled, solver, islands = self.coupled, self.newton, self.islands
+        iterates, system = solver.iterates, solver.system
         if self.contact:
-            self.contact.brace(self.integrator._dt)
+            self.contact.brace(self.integrator._dt, islands)
         self._sweep(
             self._begin,
-            [before.q, before.v, solver.held, coupled.moves]
-            + [self.integrator._dt, self.damping, solver.outer, *islands.arrays, coupled.blocks],
-            [solver.q, solver.base, solver.target],
+            [before.q, before.v, system.masks.spatial, coupled.moves]
+            + [self.integrator._dt, self.damping, solver.loading.scale, *islands.arrays, coupled.blocks],
+            [iterates.q, iterates.base, iterates.target],
         )
         if self.motion:
-            self.motion.place(islands, solver.q)
+            self.motion.place(islands, iterates.q)
         if solver.turns:
-            solver.turns.predict(before.v, not self.midpoint)
+            solver.turns.predict(before.v, not self.midpoint, iterates, system, islands)
         start = self._start_frames(before)
         if self.motion:
-            self.motion.direct(islands, solver.q, start.frame)
+            self.motion.direct(islands, iterates.q, start.frame)
         return start
 
-    def apply_loads(self) -> None:
-        """Launch the loads in time."""
-        coupled, solver = self.coupled, self.newton
+    def apply_loads(self, before) -> None:
+        """Launch the loads in time, and drag."""
+        coupled, q, loading = self.coupled, self.newton.iterates.q, self.newton.loading
         if self.loads:
-            self.loads.apply(coupled.points(solver.q), coupled.points(solver.load), coupled.angles(solver.load))
+            self.loads.apply(coupled.points(q), coupled.points(loading.force), coupled.angles(loading.force))
+        if self.drag:
+            self.drag.resist(before, q, loading.mass, loading.scale, self.islands)
 
     def warm_start(self, before) -> None:
         """Warm-start from the predictor by the last correction, and store the start."""
@@ -272,12 +275,14 @@ class CoupledStep(StepDriver):
 
     def finish(self, before, after) -> None:
         """Launch positions and rates at the end of accepted substeps."""
-        solver = self.newton
+        q = self.newton.iterates.q
         self._foresight.weigh(before)
         rate = self.contact.terms.law.rate if self.contact else after.rate
-        inputs = [solver.q, before.q, before.v, before.a, self._foresight.predicted, self._foresight.trust, rate]
+        inputs = [q, before.q, before.v, before.a, self._foresight.predicted, self._foresight.trust, rate]
         outputs = [after.q, after.v, after.a, after.rate]
         self._sweep(self._finish, [*inputs, *self.islands.arrays, self.coupled.blocks], outputs)
+        if self.drag:
+            self.drag.settle(before, after, q, self.newton.loading.mass, self.islands)
 
     def complete(self, start, before, after) -> None:
         """Update frames, magnetic field and strains to the positions."""
@@ -305,7 +310,7 @@ class CoupledStep(StepDriver):
         if not self.coupled.edges:
             return replace(before, data=self._data)
         frame, lag = self._lagged
-        start = CoupledState(self.newton.q, before.v, before.a, frame, lag, before.last, self._data)
+        start = CoupledState(self.newton.iterates.q, before.v, before.a, frame, lag, before.last, self._data)
         if self.midpoint:
             self.coupled.carry(before, start, kept=start, moved=self.islands.substep_accepted)
             return start
@@ -351,7 +356,7 @@ class CoupledStep(StepDriver):
     def _find_limits(self, s: float) -> dict[str, np.ndarray]:
         """Return the limits of islands by name, with the largest edge stiffness that float32 carries for the softest rod."""
         limits = super()._find_limits(s)
-        if any(self.newton.split):
+        if any(self.newton.elements.split):
             softest = self.coupled.rod_stiffnesses(s)[2].min()
             limits["max_edge_stiffness"] = np.full(len(self.islands), largest_carried(softest))
         return limits
@@ -372,7 +377,7 @@ class CoupledStep(StepDriver):
 
     def where(self, state, world: int) -> str:
         """Return the location of the largest residual, and the remedy."""
-        sizes = np.abs(self.newton.rhs.numpy().reshape(self.model.worlds, -1))[world]
+        sizes = np.abs(self.newton.system.rhs.numpy().reshape(self.model.worlds, -1))[world]
         worst = int(np.argmax(np.where(np.isfinite(sizes), sizes, np.inf)))
         place = Tangent(self.model).parts[-1].where(worst)
         return f"largest residual {sizes[worst]:.3g} N at {place}; {self._remedy(state, world)}"

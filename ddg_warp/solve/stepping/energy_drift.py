@@ -144,7 +144,8 @@ class CoupledEnergy(_Energy):
         self._elements = [
             coupled_energy_drift.element_kernel(part.term, real, step.newton.linear) for part in coupled.sets
         ]
-        self._load = wp.clone(step.newton.load) if coupled.host.followers else step.newton.load
+        force = step.newton.loading.force
+        self._load = wp.clone(force) if coupled.host.followers else force
         self._blocks = coupled_energy_drift.block_kernel(real, step.drag is not None)
 
     @property
@@ -156,13 +157,14 @@ class CoupledEnergy(_Energy):
     @timer("energy")
     def judge(self, before, middle) -> None:
         """Test the energy drift of the step from `before`, with the lagged data of `middle`."""
-        step, coupled, solver = self.step, self.step.coupled, self.step.newton
-        for i, (part, data, kernel) in enumerate(zip(coupled.sets, solver.parts, self._elements, strict=True)):
+        step, coupled, newton = self.step, self.step.coupled, self.step.newton
+        q, loading, outputs = newton.iterates.q, newton.loading, newton.elements.outputs
+        for i, (part, data, kernel) in enumerate(zip(coupled.sets, outputs, self._elements, strict=True)):
             wp.launch(
                 kernel,
                 (step.model.worlds, part.elements),
                 [
-                    coupled.elements(middle, i, q=solver.q, rate=step.islands.inverse_step),
+                    coupled.elements(middle, i, q=q, rate=step.islands.inverse_step),
                     before.q,
                     data["stiffness"],
                     self.floor,
@@ -172,19 +174,19 @@ class CoupledEnergy(_Energy):
                 device=self.device,
             )
         if coupled.host.followers:
-            step.loads.apply(coupled.points(solver.q), coupled.points(self._load), coupled.angles(self._load))
+            step.loads.apply(coupled.points(q), coupled.points(self._load), coupled.angles(self._load))
         wp.launch(
             self._blocks,
-            solver.all,
+            len(q),
             [
                 before.q,
                 before.v,
-                solver.q,
-                solver.mass,
+                q,
+                loading.mass,
                 *step.islands.arrays,
                 step.damping,
                 self._load,
-                solver.load,
+                loading.force,
                 self.floor,
             ]
             + [coupled.blocks],

@@ -76,10 +76,12 @@ class RodStep(StepDriver):
             self.motion.direct(self.islands, newton.x, newton.frame, newton.theta)
         return before
 
-    def apply_loads(self) -> None:
-        """Launch the loads in time."""
+    def apply_loads(self, before) -> None:
+        """Launch the loads in time, and drag."""
         if self.loads:
             self.loads.apply(self.newton.x, self.newton.load, self.newton.load_angle)
+        if self.drag:
+            self.drag.resist(before, self.newton, self.islands)
 
     def warm_start(self, before) -> None:
         """Warm-start from the predictor by the last correction, and store the start."""
@@ -107,6 +109,8 @@ class RodStep(StepDriver):
             + [self._predicted, self._predicted_angle, group.count, *self.islands.arrays],
             [after.x, after.v, after.theta, after.omega, after.a, after.alpha],
         )
+        if self.drag:
+            self.drag.settle(before, after, newton, self.islands)
 
     def complete(self, start, before, after) -> None:
         """Update frames and strains to the positions."""

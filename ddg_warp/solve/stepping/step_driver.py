@@ -179,31 +179,27 @@ class StepDriver:
 
     def move(self, before, after):
         """Launch the positions of an attempt, and their rates; return the state with the time-lagged data of its solve."""
-        contact = self.contact
+        newton, contact = self.newton, self.contact
         with timer("predictor"):  # inertial target, prescribed motion of supports
             start = self.predict(before)
         with timer("loads"):
-            self.apply_loads()
-            if self.drag:
-                self.drag.resist(before, self.newton, self.islands)
+            self.apply_loads(before)
         if not self.midpoint:
             with timer("warm start"):  # the last correction, extrapolated
                 self.warm_start(before)
         if contact:
-            contact.place()  # CCD filter of the predictor
+            contact.place(newton.iterates, newton.system, self.islands)  # CCD filter of the predictor
             contact.lag(before.q, rate=before.rate)
         self.solve(start)  # Newton's method
         for solution in contact.solutions if contact else ():  # further friction iterations
-            contact.lag_again(solution)
+            contact.lag_again(solution, newton.iterates, self.islands)
             self.solve(start)
         if contact:
-            contact.finish(before.q)  # interpenetration check
+            contact.finish(before.q, newton.iterates, self.islands)  # interpenetration check
         if self.energy:
             self.energy.judge(before, start)
         with timer("finish"):  # positions, velocities and accelerations of accepted substeps
             self.finish(before, after)
-            if self.drag:
-                self.drag.settle(before, after, self.newton, self.islands)
         return start
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:

@@ -18,16 +18,16 @@ class WarmStart:
         coupled, device, serial = newton.coupled, newton.coupled.device, device_arrays.serial(newton.coupled.device)
         self.newton = newton
         self._foresee, self._weigh, self._trust = coupled_warm_start.warm_start_kernels(
-            newton.real, newton.linear, serial
+            coupled.real, newton.linear, serial
         )
-        self.predicted = wp.zeros_like(newton.q)
-        self.trust = wp.ones(coupled.worlds, dtype=newton.real, device=device)
+        self.predicted = wp.zeros_like(newton.iterates.q)
+        self.trust = wp.ones(coupled.worlds, dtype=coupled.real, device=device)
         self._sum = None
         if newton.contact:
             takers, rows = device_arrays.takers(coupled.host.nodes, device), coupled_warm_start.SUMS
-            self._weights = wp.zeros((rows, coupled.worlds, takers), dtype=newton.real, device=device)
-            self._sums = wp.zeros((rows, coupled.worlds), dtype=newton.real, device=device)
-            self._sum = Sums(rows * coupled.worlds, takers, newton.real, device)
+            self._weights = wp.zeros((rows, coupled.worlds, takers), dtype=coupled.real, device=device)
+            self._sums = wp.zeros((rows, coupled.worlds), dtype=coupled.real, device=device)
+            self._sum = Sums(rows * coupled.worlds, takers, coupled.real, device)
 
     @property
     def kernels(self) -> list:
@@ -39,17 +39,18 @@ class WarmStart:
     def start(self, before) -> None:
         """Extrapolate from the predictor of a step from a state `before`, and keep the predictor."""
         newton, coupled = self.newton, self.newton.coupled
-        inputs = [before.a, newton.held, *newton.islands.arrays, coupled.blocks]
+        iterates, system, islands = newton.iterates, newton.system, newton.islands
+        inputs = [before.a, system.masks.spatial, *islands.arrays, coupled.blocks]
         device_arrays.sweep(
             self._foresee,
             coupled.blocks,
             inputs,
-            [newton.q, self.predicted, newton.direction],
+            [iterates.q, self.predicted, system.direction],
             coupled.device,
             worlds=coupled.worlds,
         )
         if newton.turns:
-            newton.turns.go_further(before, self.predicted)
+            newton.turns.go_further(before, self.predicted, iterates, system, islands)
 
     def weigh(self, before) -> None:
         """Find the trusted fraction of the solve's correction, in systems with contact."""
@@ -58,7 +59,7 @@ class WarmStart:
         newton, coupled, islands = self.newton, self.newton.coupled, self.newton.islands
         nodes = coupled.host.nodes
         inputs = [
-            newton.q,
+            newton.iterates.q,
             self.predicted,
             before.a,
             coupled.mass.flatten(),
@@ -69,5 +70,5 @@ class WarmStart:
         ]
         device_arrays.sweep(self._weigh, nodes, inputs, [self._weights], coupled.device, worlds=coupled.worlds)
         self._sum(self._weights.reshape((coupled_warm_start.SUMS * coupled.worlds, -1)), self._sums.flatten())
-        inputs = [self._sums, newton.options.rtol, newton.allowed.total, islands.arrays[1]]
+        inputs = [self._sums, newton.options.rtol, newton.tolerances.total, islands.arrays[1]]
         wp.launch(self._trust, coupled.worlds, inputs, [self.trust], device=coupled.device)
