@@ -86,8 +86,8 @@ def _counters(integrator) -> dict:
         contact = integrator._coupled.newton.contact
         tally = contact.tally
         result |= {
-            "contact/crossed": contact.crossed,
-            "contact/least": contact.least,
+            "contact/crossed": tally.crossed,
+            "contact/least": tally.least,
             "contact/searches": search.searches,
         }
         result |= {"contact/counts": tally.counts, "contact/friction_work": tally.work}

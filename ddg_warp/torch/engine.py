@@ -144,7 +144,7 @@ class Engine:
         if coupled is not None and coupled.newton.contact and not torch._C._are_functorch_transforms_active():
             with torch.no_grad(), self.turn():
                 self.fill(self.source, state)
-                coupled.newton.contact.check(self.before.coupled.q)
+                coupled.newton.contact.diagnosis.check(self.before.coupled.q)
 
     @staticmethod
     def fill(targets: list[torch.Tensor], values) -> None:

@@ -39,20 +39,20 @@ UNTRIED = 2  # iterates without the exact matrix after one in which it was indef
 
 
 @cache
-def world_kernels(real):
-    """Build the kernels with one thread per world.
+def contact_kernels(real, linear, serial: bool):
+    """Build the kernels of contact in the line search and in the matrix.
 
     `account`: add the contact energy to the change since the accepted iterate.
-    `modes`, `predicted`: choose the motion mode of an update or a predictor.
-    `depart`: advance the state of moving supports.
+    `gain`: write the predicted decrease of a motion.
     `expect`: correct the predicted decrease of a limited update.
     `refuse`: reject substeps with crossings.
     `curve`: choose the exact or the projected matrix.
     `again`: continue converged worlds with updated friction.
-    `short`: mark worlds with a limited predictor.
-    `less`: correct the fraction of a motion that was shortened before CCD.
+    `keep`: store the solution.
     `brace`: set the rate of inertia in contact stiffness.
     """
+    V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
+    first_item, until = items_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def account(
@@ -79,33 +79,24 @@ def world_kernels(real):
             noise[w] = noise[w] + wp.abs(energy[w])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def modes(flags: wp.array2d(dtype=int), modes_out: wp.array(dtype=int), longest_out: wp.array(dtype=real)):
-        """Choose modes: one fraction for updates that the line search has shortened, so that short ones descend. Reset `longest`."""
-        w = wp.tid()
-        longest_out[w] = real(0.0)
-        modes_out[w] = wp.static(NONE)
-        if flags[ITERATE_ACTION, w] == wp.static(ROTATE_EDGES) or flags[ITERATE_ACTION, w] == wp.static(MOVE_STRAIGHT):
-            modes_out[w] = wp.where(
-                flags[BACKTRACKS, w] > 0, int(wp.static(SINGLE_FRACTION)), int(wp.static(PER_BODY_FRACTION))
-            )
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def predicted(flags: wp.array2d(dtype=int), modes_out: wp.array(dtype=int), longest_out: wp.array(dtype=real)):
-        """Choose modes of predictors, in worlds that take the step."""
-        w = wp.tid()
-        longest_out[w] = real(0.0)
-        modes_out[w] = wp.where(
-            flags[SUBSTEP_ACCEPTED, w] != 0, int(wp.static(PER_BODY_FRACTION)), int(wp.static(NONE))
-        )
-        flags[SUPPORT_MOTION_PENDING, w] = 0
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def depart(modes: wp.array(dtype=int), flags: wp.array2d(dtype=int)):
-        w = wp.tid()
-        if modes[w] != wp.static(NONE):
-            flags[SUPPORT_MOTION_PENDING, w] = wp.where(
-                flags[SUPPORT_MOTION_PENDING, w] == wp.static(SUPPORTS_MOVING), int(wp.static(SUPPORTS_ARRIVED)), int(0)
-            )
+    def gain(
+        rhs: wp.array(dtype=H),
+        q: wp.array(dtype=V),
+        base: wp.array(dtype=V),
+        modes: wp.array(dtype=int),
+        blocks: int,
+        dots_out: wp.array2d(dtype=real),
+    ):
+        """Write r . (q - base), summed over the blocks of a thread."""
+        w, start = first_item(wp.tid(), blocks)
+        if modes[w] == wp.static(NONE):
+            return
+        total = real(0.0)
+        for k in range(start, until(start, blocks)):
+            i = k + w * blocks
+            r = rhs[i]
+            total += wp.dot(V(real(r[0]), real(r[1]), real(r[2])), q[i] - base[i])
+        dots_out[w, start] = total
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def expect(
@@ -195,20 +186,12 @@ def world_kernels(real):
             flags[ANY_ACTIVE, 0] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def short(modes: wp.array(dtype=int), time: wp.array(dtype=real), flags: wp.array2d(dtype=int)):
-        """Mark worlds with a predictor limited by CCD as moving."""
-        w = wp.tid()
-        if modes[w] != wp.static(NONE):
-            flags[CCD_LIMITED, w] = int(time[w] < real(1.0))
-            if flags[CCD_LIMITED, w] != 0:
-                flags[SUPPORT_MOTION_PENDING, w] = wp.static(SUPPORTS_MOVING)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def less(modes: wp.array(dtype=int), longest: wp.array(dtype=real), most: real, time: wp.array(dtype=real)):
-        """Correct the fraction of a motion that was shortened to `most` [m] before CCD."""
-        w = wp.tid()
-        if modes[w] == wp.static(SINGLE_FRACTION) and longest[w] > most:
-            time[w] = time[w] * (most / longest[w])
+    def keep(q: wp.array(dtype=V), moved: wp.array(dtype=int), blocks: int, out: wp.array(dtype=V)):
+        """Store positions of worlds that are solved; other entries keep their last solution."""
+        w, start = first_item(wp.tid(), blocks)
+        if moved[w] != 0:
+            for k in range(start, until(start, blocks)):
+                out[k + w * blocks] = q[k + w * blocks]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def brace(
@@ -228,137 +211,42 @@ def world_kernels(real):
             braced[w] = 1
         rate[w] = wp.where(braced[w] != 0, real(1.0) / (dt[w] * scalars[SUBSTEP_FRACTION, w]), real(0.0))
 
-    return account, modes, predicted, depart, expect, refuse, curve, again, short, less, brace
+    return account, gain, expect, refuse, curve, again, keep, brace
 
 
 @cache
-def block_kernels(real, linear, serial: bool):
-    """Build the kernels over dof blocks.
+def limit_kernels(real, serial: bool):
+    """Build the kernels of step fractions.
 
-    `gain`: write the predicted decrease of a motion.
-    `lessen`: subtract a product from the residual.
-    `aim`: store the prescribed positions of supports.
-    `push`: write the remaining motion of supports into the direction.
-    `land`: put supports at the end of a full step.
-    `arrive`: put supports at prescribed positions, or mark the world as moving.
+    `modes`, `predicted`: choose the motion mode of an update or a predictor.
     `stay`: write starts and proposed ends of motions; choose one fraction for long ones.
     `near`: shorten long motions.
-    `part`: discard proposed motions that have ended.
-    `way`: write the remainder of a proposed motion.
-    `add`: add that remainder to the direction.
-    `keep`: store the solution.
+    `less`: correct the fraction of a motion that was shortened before CCD.
+    `short`: mark worlds with a limited predictor.
     """
-    V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
-    _, free = product_functions(linear)
+    V = wp.types.vector(3, real)
     first_item, until = items_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def gain(
-        rhs: wp.array(dtype=H),
-        q: wp.array(dtype=V),
-        base: wp.array(dtype=V),
-        modes: wp.array(dtype=int),
-        blocks: int,
-        dots_out: wp.array2d(dtype=real),
-    ):
-        """Write r . (q - base), summed over the blocks of a thread."""
-        w, start = first_item(wp.tid(), blocks)
-        if modes[w] == wp.static(NONE):
-            return
-        total = real(0.0)
-        for k in range(start, until(start, blocks)):
-            i = k + w * blocks
-            r = rhs[i]
-            total += wp.dot(V(real(r[0]), real(r[1]), real(r[2])), q[i] - base[i])
-        dots_out[w, start] = total
+    def modes(flags: wp.array2d(dtype=int), modes_out: wp.array(dtype=int), longest_out: wp.array(dtype=real)):
+        """Choose modes: one fraction for updates that the line search has shortened, so that short ones descend. Reset `longest`."""
+        w = wp.tid()
+        longest_out[w] = real(0.0)
+        modes_out[w] = wp.static(NONE)
+        if flags[ITERATE_ACTION, w] == wp.static(ROTATE_EDGES) or flags[ITERATE_ACTION, w] == wp.static(MOVE_STRAIGHT):
+            modes_out[w] = wp.where(
+                flags[BACKTRACKS, w] > 0, int(wp.static(SINGLE_FRACTION)), int(wp.static(PER_BODY_FRACTION))
+            )
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def lessen(
-        product: wp.array(dtype=H),
-        fixed: wp.array(dtype=wp.uint8),
-        wanted: wp.array(dtype=int),
-        blocks: int,
-        rhs: wp.array(dtype=H),
-    ):
-        """Subtract a product from the residual on free dofs of worlds that need a direction."""
-        w, start = first_item(wp.tid(), blocks)
-        if wanted[w] != 0:
-            for k in range(start, until(start, blocks)):
-                i = k + w * blocks
-                rhs[i] = rhs[i] - wp.cw_mul(product[i], free(fixed[k]))
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def aim(nodes: wp.array(dtype=int), blocks: int, q: wp.array(dtype=V), aims_out: wp.array2d(dtype=V)):
-        i, w = wp.tid()
-        aims_out[i, w] = q[nodes[i] + w * blocks]
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def push(
-        nodes: wp.array(dtype=int),
-        aims: wp.array2d(dtype=V),
-        q: wp.array(dtype=V),
-        fixed: wp.array(dtype=wp.uint8),
-        wanted: wp.array(dtype=int),
-        blocks: int,
-        direction: wp.array(dtype=H),
-    ):
-        """Write the remaining motion of supports, to prescribed positions, into the direction."""
-        i, w = wp.tid()
-        if wanted[w] == 0:
-            return
-        k = nodes[i]
-        d = aims[i, w] - q[k + w * blocks]
-        for c in range(3):
-            if ((int(fixed[k]) >> c) & 1) != 0:
-                direction[k + w * blocks][c] = linear(d[c])
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def land(
-        nodes: wp.array(dtype=int),
-        aims: wp.array2d(dtype=V),
-        fixed: wp.array(dtype=wp.uint8),
-        modes: wp.array(dtype=int),
-        flags: wp.array2d(dtype=int),
-        scalars: wp.array2d(dtype=real),
-        blocks: int,
-        q: wp.array(dtype=V),
-    ):
-        """Set supports to prescribed positions after a full step, without the rounding of directions."""
-        i, w = wp.tid()
-        if modes[w] == wp.static(NONE) or flags[SUPPORT_MOTION_PENDING, w] == 0 or scalars[STEP_LENGTH, w] != real(1.0):
-            return
-        k = nodes[i]
-        x = q[k + w * blocks]
-        for c in range(3):
-            if ((int(fixed[k]) >> c) & 1) != 0:
-                x[c] = aims[i, w][c]
-        q[k + w * blocks] = x
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def arrive(
-        nodes: wp.array(dtype=int),
-        aims: wp.array2d(dtype=V),
-        fixed: wp.array(dtype=wp.uint8),
-        modes: wp.array(dtype=int),
-        eps: real,
-        blocks: int,
-        q: wp.array(dtype=V),
-        flags: wp.array2d(dtype=int),
-    ):
-        """Set supports to prescribed positions if only rounding is missing; else mark the world as moving."""
-        i, w = wp.tid()
-        if modes[w] == wp.static(NONE):
-            return
-        k = nodes[i]
-        x = q[k + w * blocks]
-        for c in range(3):
-            if ((int(fixed[k]) >> c) & 1) != 0:
-                goal = aims[i, w][c]
-                if wp.abs(goal - x[c]) <= eps * (wp.abs(goal) + wp.abs(x[c])):
-                    x[c] = goal
-                else:
-                    flags[SUPPORT_MOTION_PENDING, w] = wp.static(SUPPORTS_MOVING)
-        q[k + w * blocks] = x
+    def predicted(flags: wp.array2d(dtype=int), modes_out: wp.array(dtype=int), longest_out: wp.array(dtype=real)):
+        """Choose modes of predictors, in worlds that take the step."""
+        w = wp.tid()
+        longest_out[w] = real(0.0)
+        modes_out[w] = wp.where(
+            flags[SUBSTEP_ACCEPTED, w] != 0, int(wp.static(PER_BODY_FRACTION)), int(wp.static(NONE))
+        )
+        flags[SUPPORT_MOTION_PENDING, w] = 0
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def stay(
@@ -411,6 +299,104 @@ def block_kernels(real, linear, serial: bool):
                     q[i] = base[i] + (most / longest[w]) * (q[i] - base[i])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def less(modes: wp.array(dtype=int), longest: wp.array(dtype=real), most: real, time: wp.array(dtype=real)):
+        """Correct the fraction of a motion that was shortened to `most` [m] before CCD."""
+        w = wp.tid()
+        if modes[w] == wp.static(SINGLE_FRACTION) and longest[w] > most:
+            time[w] = time[w] * (most / longest[w])
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def short(modes: wp.array(dtype=int), time: wp.array(dtype=real), flags: wp.array2d(dtype=int)):
+        """Mark worlds with a predictor limited by CCD as moving."""
+        w = wp.tid()
+        if modes[w] != wp.static(NONE):
+            flags[CCD_LIMITED, w] = int(time[w] < real(1.0))
+            if flags[CCD_LIMITED, w] != 0:
+                flags[SUPPORT_MOTION_PENDING, w] = wp.static(SUPPORTS_MOVING)
+
+    return modes, predicted, stay, near, less, short
+
+
+@cache
+def pending_kernels(real, linear, serial: bool):
+    """Build the kernels of pending motion.
+
+    `aim`: store the prescribed positions of supports.
+    `depart`: advance the state of moving supports.
+    `land`: put supports at the end of a full step.
+    `arrive`: put supports at prescribed positions, or mark the world as moving.
+    `part`: discard proposed motions that have ended.
+    `way`: write the remainder of a proposed motion.
+    `push`: write the remaining motion of supports into the direction.
+    `lessen`: subtract a product from the residual.
+    `add`: add that remainder to the direction.
+    """
+    V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
+    _, free = product_functions(linear)
+    first_item, until = items_function(serial), until_function(serial)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def aim(nodes: wp.array(dtype=int), blocks: int, q: wp.array(dtype=V), aims_out: wp.array2d(dtype=V)):
+        i, w = wp.tid()
+        aims_out[i, w] = q[nodes[i] + w * blocks]
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def depart(modes: wp.array(dtype=int), flags: wp.array2d(dtype=int)):
+        w = wp.tid()
+        if modes[w] != wp.static(NONE):
+            flags[SUPPORT_MOTION_PENDING, w] = wp.where(
+                flags[SUPPORT_MOTION_PENDING, w] == wp.static(SUPPORTS_MOVING), int(wp.static(SUPPORTS_ARRIVED)), int(0)
+            )
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def land(
+        nodes: wp.array(dtype=int),
+        aims: wp.array2d(dtype=V),
+        fixed: wp.array(dtype=wp.uint8),
+        modes: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        blocks: int,
+        q: wp.array(dtype=V),
+    ):
+        """Set supports to prescribed positions after a full step, without the rounding of directions."""
+        i, w = wp.tid()
+        if modes[w] == wp.static(NONE) or flags[SUPPORT_MOTION_PENDING, w] == 0 or scalars[STEP_LENGTH, w] != real(1.0):
+            return
+        k = nodes[i]
+        x = q[k + w * blocks]
+        for c in range(3):
+            if ((int(fixed[k]) >> c) & 1) != 0:
+                x[c] = aims[i, w][c]
+        q[k + w * blocks] = x
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def arrive(
+        nodes: wp.array(dtype=int),
+        aims: wp.array2d(dtype=V),
+        fixed: wp.array(dtype=wp.uint8),
+        modes: wp.array(dtype=int),
+        eps: real,
+        blocks: int,
+        q: wp.array(dtype=V),
+        flags: wp.array2d(dtype=int),
+    ):
+        """Set supports to prescribed positions if only rounding is missing; else mark the world as moving."""
+        i, w = wp.tid()
+        if modes[w] == wp.static(NONE):
+            return
+        k = nodes[i]
+        x = q[k + w * blocks]
+        for c in range(3):
+            if ((int(fixed[k]) >> c) & 1) != 0:
+                goal = aims[i, w][c]
+                if wp.abs(goal - x[c]) <= eps * (wp.abs(goal) + wp.abs(x[c])):
+                    x[c] = goal
+                else:
+                    flags[SUPPORT_MOTION_PENDING, w] = wp.static(SUPPORTS_MOVING)
+        q[k + w * blocks] = x
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def part(
         q: wp.array(dtype=V),
         flags: wp.array2d(dtype=int),
@@ -442,18 +428,45 @@ def block_kernels(real, linear, serial: bool):
             remainder_out[i] = wp.where(wanted[w] != 0, H(linear(d[0]), linear(d[1]), linear(d[2])), H())
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def push(
+        nodes: wp.array(dtype=int),
+        aims: wp.array2d(dtype=V),
+        q: wp.array(dtype=V),
+        fixed: wp.array(dtype=wp.uint8),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        direction: wp.array(dtype=H),
+    ):
+        """Write the remaining motion of supports, to prescribed positions, into the direction."""
+        i, w = wp.tid()
+        if wanted[w] == 0:
+            return
+        k = nodes[i]
+        d = aims[i, w] - q[k + w * blocks]
+        for c in range(3):
+            if ((int(fixed[k]) >> c) & 1) != 0:
+                direction[k + w * blocks][c] = linear(d[c])
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def lessen(
+        product: wp.array(dtype=H),
+        fixed: wp.array(dtype=wp.uint8),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        rhs: wp.array(dtype=H),
+    ):
+        """Subtract a product from the residual on free dofs of worlds that need a direction."""
+        w, start = first_item(wp.tid(), blocks)
+        if wanted[w] != 0:
+            for k in range(start, until(start, blocks)):
+                i = k + w * blocks
+                rhs[i] = rhs[i] - wp.cw_mul(product[i], free(fixed[k]))
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def add(remainder: wp.array(dtype=H), wanted: wp.array(dtype=int), blocks: int, direction: wp.array(dtype=H)):
         w, start = first_item(wp.tid(), blocks)
         if wanted[w] != 0:
             for k in range(start, until(start, blocks)):
                 direction[k + w * blocks] += remainder[k + w * blocks]
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def keep(q: wp.array(dtype=V), moved: wp.array(dtype=int), blocks: int, out: wp.array(dtype=V)):
-        """Store positions of worlds that are solved; other entries keep their last solution."""
-        w, start = first_item(wp.tid(), blocks)
-        if moved[w] != 0:
-            for k in range(start, until(start, blocks)):
-                out[k + w * blocks] = q[k + w * blocks]
-
-    return gain, lessen, aim, push, land, arrive, stay, near, part, way, add, keep
+    return aim, depart, land, arrive, part, way, push, lessen, add

@@ -102,7 +102,7 @@ class StaticNewton(CoupledNewton):
         self.iterates.base.assign((q if before is None else before).reshape(-1, 3))
         if self.contact:
             wp.copy(self._before, self.iterates.base)
-            self.contact.rest(self.iterates, self.islands)
+            self.contact.pending.clear(self.iterates, self.islands)
         if self.has_friction:
             self.contact.rate.fill_(rate)
             if slid is not None:
@@ -253,7 +253,7 @@ class CoupledEquilibrium:
             self._friction_work += increment * float(touch.terms.dissipated.numpy().sum())
 
     def contact_statistics(self) -> dict:
-        """Return statistics of the counted equilibria, as `NewtonContact.statistics`.
+        """Return statistics of the counted equilibria, as `ContactStatistics.statistics`.
 
         Without interpenetrations: iterates do not lead to an equilibrium along a straight motion.
         """
@@ -400,7 +400,7 @@ class CoupledEquilibrium:
             if warily and unbalanced > SETTLED * (loads + supports):
                 name = UNSETTLED
         if status > outcome.CONVERGED_TO_ROUNDING or name == UNSETTLED:
-            remedy = self.newton.contact.closest_pair(state.coupled.q, status) if self.newton.contact else ""
+            remedy = self.newton.contact.diagnosis.closest_pair(state.coupled.q, status) if self.newton.contact else ""
             if rubs:
                 remedy += "sliding bodies may have no equilibrium"
             message = owner.residuals.where(name, residual, load_factor, remedy)
@@ -465,7 +465,7 @@ class CoupledEquilibrium:
         factor = relaxation(displacement, (displacement * fixed).any(1))
         if (factor < 1.0).any():
             relaxed = begun + (factor[:, None] * displacement).reshape(begun.shape)
-            if self.newton.contact.share(begun, relaxed) == 1.0:
+            if self.newton.contact.limit.fraction(begun, relaxed) == 1.0:
                 state.coupled.q.assign(relaxed)
 
     @property
@@ -475,7 +475,9 @@ class CoupledEquilibrium:
 
     def share(self, before: np.ndarray, after: np.ndarray) -> float:
         """Return the CCD step fraction of the motion from dofs `before` to `after`."""
-        return self.newton.contact.share(self.tangent.back(before), self.tangent.back(self._beside(before, after)))
+        return self.newton.contact.limit.fraction(
+            self.tangent.back(before), self.tangent.back(self._beside(before, after))
+        )
 
     def _replay(self, name: str, begin: Callable[[], None], launch: Callable[[], None]) -> None:
         """Replay the launches captured under a name, again from the beginning while lists of pairs overflow."""

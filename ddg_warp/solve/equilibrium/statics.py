@@ -304,13 +304,13 @@ class Equilibrium:
     def check_apart(self, state: State) -> None:
         """Refuse a start with overlapping surfaces, except for a penalty."""
         if self.model.touch and self.model.touch.keep:
-            self.coupled.newton.contact.check(state.coupled.q)
+            self.coupled.newton.contact.diagnosis.check(state.coupled.q)
 
     def _blocked(self, state: State, start: float, end: float) -> str:
         """Return the remedy for two fixed objects driven into each other by motions; empty without."""
         if not self.model.touch:
             return ""
-        return self.coupled.newton.contact.blocked(self.tangent, state, start, end).rstrip(", ")
+        return self.coupled.newton.contact.diagnosis.blocked(self.tangent, state, start, end).rstrip(", ")
 
     def share(self, before: State, after: State) -> float:
         """Return the CCD step fraction of the straight path between two states."""

@@ -3,6 +3,7 @@
 import warp as wp
 
 from ddg_warp.solve.linear.contact_bands import ContactBands
+from ddg_warp.timers import timer
 
 
 class ContactHessian:
@@ -40,6 +41,7 @@ class ContactHessian:
         if self._bands:
             self._terms.join()
 
+    @timer("contact")
     def add_to_bands(self, flags: wp.array) -> None:
         """Add the blocks to the preconditioner, once its own are assembled, in worlds whose flags want a direction."""
         if self._bands:

@@ -296,10 +296,10 @@ class CoupledNewton:
             self.chains.direct(system, self.loading.mass, islands, self.updated_islands)
         else:
             if self.contact:
-                self.contact.approach(self.iterates, system)
+                self.contact.pending.approach(self.iterates, system, self.contact.terms)
             self.krylov.solve(system, islands, self.after_cycle)
             if self.contact:
-                self.contact.follow(system)
+                self.contact.pending.follow(system)
         if self._repeat:  # repeat indefinite iterates without second derivatives and compression
             inputs = [1, *islands.arrays, system.indefinite]
             wp.launch(self._repeat, self.coupled.worlds, inputs, device=self.coupled.device)

@@ -69,7 +69,7 @@ class CoupledStep(StepDriver):
         if counts_of is not None:
             self.newton.search_state.pcg_work = counts_of.newton.pcg_work
             if solver.contact:
-                solver.contact.go_on(counts_of.newton.contact)
+                solver.contact.tally.go_on(counts_of.newton.contact.tally)
         if solver.contact:
             tally = solver.contact.search.more[: len(self.tally)]
             wp.copy(tally, self.tally)
@@ -400,7 +400,7 @@ class CoupledStep(StepDriver):
             return self.advice(state)
         reason = int(self.islands.failure_status.numpy()[world])
         begin = state.time - self.integrator._dt_host
-        message = self.newton.contact.blocked(Tangent(self.model), state, begin, state.time)
-        message = message or self.newton.contact.closest_pair(state.coupled.q, reason)
+        message = self.newton.contact.diagnosis.blocked(Tangent(self.model), state, begin, state.time)
+        message = message or self.newton.contact.diagnosis.closest_pair(state.coupled.q, reason)
         helped = message.endswith(", ")
         return message + ("or check its loads and supports" if helped else self.advice(state))

@@ -204,7 +204,7 @@ class DecoupledStep:
         self._launch(self._judge, self.coupled.worlds, inputs, outputs)
 
     def _measure(self, before, after) -> None:
-        self._search.passing(before.q, self.step_of.newton.contact.touch.keep)
+        self._search.passing(before.q, self.step_of.newton.contact.limit.keep)
         self._search.measure(after.q, enough=self._search.reach)
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:

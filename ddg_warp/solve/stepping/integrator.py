@@ -319,7 +319,7 @@ class Integrator:
         """Return counts since the integrator was made: Newton iterations of a solve, retries, lost pivots, outcomes.
 
         "energy", if watched, has the energy drift, the work of damping [J] and the largest relative drift since the last state from
-        outside; see `energy_bound`. For "contact" see `NewtonContact.statistics`.
+        outside; see `energy_bound`. For "contact" see `ContactStatistics.statistics`.
         """
         tally = sum(part.tally.numpy() for part in self._parts)
         work = np.array([part.work.numpy() for part in self._parts])
@@ -338,7 +338,7 @@ class Integrator:
         if self.energy_bound is not None:
             result["energy"] = energy_drift.summary([part.energy for part in self._parts])
         if self._coupled is not None and self._coupled.newton.contact:
-            result["contact"] = self._coupled.newton.contact.statistics()
+            result["contact"] = self._coupled.newton.contact.tally.statistics()
         return result
 
     @timer("controls")
@@ -420,7 +420,7 @@ class Integrator:
         if self._coupled is not None:
             self._coupled.arrive()
             if self._coupled.newton.contact:
-                self._coupled.newton.contact.check(self._buffers[0].own.coupled.q)
+                self._coupled.newton.contact.diagnosis.check(self._buffers[0].own.coupled.q)
         return 0
 
     def step_whole(self) -> None:
