@@ -133,7 +133,7 @@ class Problem:
         newton.balance()
         newton.assemble()
         if newton.chains and newton.chains.exact:  # direct substructuring assembles during the solve
-            newton.chains.assemble(newton.system.matrix, newton.loading.mass, newton.islands)
+            newton.chains.bands.assemble(newton.system.matrix, newton.loading.mass, newton.islands)
         return self
 
     def iterate(self, forcing: float):
@@ -161,7 +161,7 @@ class Problem:
         chains = self.newton.chains
         if chains is None or not chains.banded:
             return H
-        plan, bands = chains.plan, chains.bands.numpy()[:, :, world * chains.width :]
+        plan, bands = chains.plan, chains.bands.blocks.numpy()[:, :, world * chains.paths.width :]
         nb = 4 if plan.twist else 3
         node, angle = plan.places[0], plan.places[1] if plan.twist else None
         free = self.free()

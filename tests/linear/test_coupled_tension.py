@@ -74,7 +74,7 @@ def test_directions_match_full_matrix(device, twist):
         along = np.sum(edges * steps, axis=-1) / np.linalg.norm(edges, axis=-1)
         element = newton.chains.plan.elements(newton.coupled.host, element_set.host)[1]
         k, c = np.nonzero(element >= 0)
-        longer = device_arrays.download(newton.chains.longer).reshape(2, newton.chains.longest, 2, -1)
+        longer = device_arrays.download(newton.chains.bands.longer).reshape(2, newton.chains.paths.longest, 2, -1)
         slack, lengthening = longer[:, k, :, c].transpose(1, 2, 0)
         assert (slack > 0.0).any() == (carried < 1e9)
         expected = along[:, element[k, c]]

@@ -18,7 +18,7 @@ class ContactBands:
         self.chains, self._edges = chains, len(shapes.things(2)[0])
         next_edge = _following_edges(shapes, chains.plan, chains.coupled.blocks)
         angle_edge = _turning(shapes, chains.plan, chains.coupled.blocks)
-        self._stiffen = stiffen_kernel(chains.plan.twist, chains.bands.dtype, bool((angle_edge >= 0).any()))
+        self._stiffen = stiffen_kernel(chains.plan.twist, chains.bands.blocks.dtype, bool((angle_edge >= 0).any()))
         self.kernels = [self._stiffen]
         self._ahead, self._turning = (
             device_arrays.upload(edges, int, chains.device) for edges in (next_edge, angle_edge)
@@ -29,10 +29,10 @@ class ContactBands:
         direction.
         """
         chains = self.chains
-        inputs = [chains.bands, chains.layout, self._ahead, self._edges, flags, chains.coupled.blocks]
+        inputs = [chains.bands.blocks, chains.paths.layout, self._ahead, self._edges, flags, chains.coupled.blocks]
         inputs += [terms.diagonal, terms.between, self._turning, *terms.turned]
-        dim = chains.longest, chains.columns
-        wp.launch(self._stiffen, dim, inputs, [chains.eliminated], device=chains.device)
+        dim = chains.paths.longest, chains.paths.columns
+        wp.launch(self._stiffen, dim, inputs, [chains.bands.eliminated], device=chains.device)
 
 
 def _turning(shapes, plan, blocks: int) -> np.ndarray:

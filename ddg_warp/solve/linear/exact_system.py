@@ -55,7 +55,7 @@ class ExactSystem:
         self.sparsity = SparseSystem(coupled)
         self.planes = SkewSupports(coupled, self.sparsity, real, self.linear) if host.frames else None
         if self.chains:
-            self.chains.bind(self.sparsity, [], real, self.linear, (), drag)
+            self.chains.bind(self.sparsity, [], self.linear, (), drag)
             if contact:
                 contact.hessian.bind(self.chains)
         self.mass = inertia if drag else coupled.mass
@@ -137,7 +137,7 @@ class ExactSystem:
         if self.planes:
             self.planes.matrix(system.matrix, system.wanted)
         if self.chains:
-            self.chains.assemble(system.matrix, self.mass, self.islands)
+            self.chains.bands.assemble(system.matrix, self.mass, self.islands)
         if self.contact:
             self.contact.hessian.assemble()
             self.contact.hessian.add_to_bands(flags)

@@ -87,7 +87,7 @@ class LinearSystem:
             rhs=make(worlds * blocks, vector),
             direction=make(worlds * blocks, vector),
             dots=make((worlds, blocks), linear),
-            masks=DofMasks.of(coupled, chains and chains.idle),
+            masks=DofMasks.of(coupled, chains and chains.paths.idle),
             wanted=wanted,
             outdated=outdated,
             iterations=make(worlds, int),

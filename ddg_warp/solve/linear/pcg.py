@@ -121,7 +121,7 @@ class PCG:
     def precondition(self, system, z: wp.array) -> None:
         """Apply substructuring and multilevel to z, on entry the residual times inverse diagonal blocks; write r . z."""
         if self.chains:
-            self.chains.apply(system, self.rest, z)
+            self.chains.apply(system, self.rest, z, self._unread[0])
         if self.levels:
             self.levels.apply(self.rest, system.masks.inactive, system.wanted, z, system.dots)
 
@@ -152,7 +152,7 @@ class PCG:
     def multiply(self, system, p: wp.array) -> None:
         """Write H p on active dofs, and p . H p block by block; no matrix has the contact terms."""
         if self.chains and self.chains.banded:  # elements along rods are stored in bands
-            elements = partial(self.chains.product, system, p, self.product)
+            elements = partial(self.chains.bands.product, system, p, self.product)
         else:
             elements = partial(self.multiply_matrix, system, p)
         if not self.contact:

@@ -150,7 +150,6 @@ class MatrixAssembly:
         coupled,
         table: SparseSystem,
         written: list[dict],
-        real,
         linear,
         exact_from: tuple,
         local: tuple,
@@ -164,7 +163,9 @@ class MatrixAssembly:
             )
             terms = tuple(part.term for part in sets)
             self.kernels.append(
-                sliced_ell.assemble_kernel(terms, real, linear, first == 0, from_iteration, local_dofs, drag, serial)
+                sliced_ell.assemble_kernel(
+                    terms, coupled.real, linear, first == 0, from_iteration, local_dofs, drag, serial
+                )
             )
             set_data = []
             for i in range(first, first + len(sets)):

@@ -34,7 +34,7 @@ class TwistedFactorisation:
         """Write the solution z of the blocks at path nodes, and r . z; `values` are scratch.
 
         Args:
-            inputs: residual of blocks, arrays `places`, `held`, `count`, `idle` of `RodSubstructuring`, `wanted` (1) of worlds,
+            inputs: residual of blocks, arrays `places`, `held`, `count`, `idle` of `RodPaths`, `wanted` (1) of worlds,
                 blocks of a world.
         """
         self._launch(self._inward, 2 * self._columns, [factors, *inputs], [values, self._taken])

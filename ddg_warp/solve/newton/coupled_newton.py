@@ -88,7 +88,7 @@ class CoupledNewton:
         self.planes = SkewSupports(coupled, self.sparsity, real, self.linear) if host.frames else None
         banded = self.chains is not None and self.chains.banded
         self.elements = ElementEvaluation(coupled, self.psd, self.linear, banded, split)
-        matrix = self.sparsity, self.elements.outputs, real, self.linear, self.elements.exact_from
+        matrix = self.sparsity, self.elements.outputs, self.linear, self.elements.exact_from
         self._assembly = MatrixAssembly(coupled, *matrix, self.elements.local, drag)
         if self.chains:
             self.chains.bind(*matrix, drag, reuse)
@@ -284,7 +284,7 @@ class CoupledNewton:
         if self.planes:
             self.planes.matrix(matrix, updated_islands.needs_direction)
         if self.chains and not self.exact:
-            self.chains.assemble(matrix, mass, updated_islands)
+            self.chains.bands.assemble(matrix, mass, updated_islands)
 
     @timer("direction")
     def direct(self) -> None:

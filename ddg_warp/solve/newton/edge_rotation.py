@@ -40,7 +40,7 @@ class EdgeRotations:
         between = wp.array(between, dtype=real, device=device)
         self._places = [self._nodes, put(pieces.of), self._starts, put(anchors), between]
         # path node with the tension of every edge, and the lengthening by tensions
-        self._behind = [put(chains.plan.places_ahead(rod)), chains.longer, chains.width] if chains else []
+        self._behind = [put(chains.plan.places_ahead(rod)), chains.bands.longer, chains.paths.width] if chains else []
         self._ends = put(np.concatenate([rod.ends for rod in host.rods]))
         vector, worlds = wp.types.vector(3, real), coupled.worlds
         self._sums = wp.zeros((worlds, len(plan.nodes)), dtype=vector, device=device)

@@ -24,7 +24,7 @@ class ResidualAssembler:
         self, coupled, elements, sparsity, chains, planes, tolerances, contact, linear, rtol: float, floor: float, drag
     ):
         self.coupled, host, real, lengths = coupled, coupled.host, coupled.real, coupled.host.edge_lengths
-        self.chains = chains if chains and chains.banded else None
+        self.bands = chains.bands if chains and chains.banded else None
         self._inputs = inputs = coupled_residual.inputs_type(real, drag)()
         self._outputs = outputs = coupled_residual.results_type(real, linear)()
         inputs.arm, inputs.longest, inputs.settled = lengths.mean(), lengths.max(), SETTLED * host.bodies.shortest
@@ -35,9 +35,9 @@ class ResidualAssembler:
         # an array of structures keeps no member alive
         self._meetings = list(_contributions(coupled, elements, sparsity, linear))
         self._sets = wp.array(self._meetings, dtype=coupled_residual.meeting_type(real, linear), device=coupled.device)
-        off_path_blocks = self.chains.elsewhere if self.chains else np.arange(0)
+        off_path_blocks = self.bands.elsewhere if self.bands else np.arange(0)
         self._some = wp.array(off_path_blocks.astype(np.int32), dtype=int, device=coupled.device)
-        self._count = len(off_path_blocks) if self.chains else coupled.blocks
+        self._count = len(off_path_blocks) if self.bands else coupled.blocks
         types = int, wp.types.matrix((3, 3), real)
         self._frames = (
             [planes.of_blocks, planes.frames[real]]
@@ -54,8 +54,8 @@ class ResidualAssembler:
         inputs.mass, inputs.gravity, inputs.load = loading.mass, loading.gravity, loading.force
         inputs.fixed, outputs.rhs = system.masks.fixed, system.rhs
         outputs.change, outputs.noise, outputs.square = norms.change, norms.noise, norms.square
-        if self.chains:
-            self.chains.balance(inputs, islands, outputs)
+        if self.bands:
+            self.bands.balance(inputs, islands, outputs)
         device_arrays.sweep(
             self.kernels[0],
             total,

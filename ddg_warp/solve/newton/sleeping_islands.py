@@ -45,7 +45,7 @@ class SleepingIslands:
         self.owner, self._body = put(np.concatenate(owner)), put(body)
         self._link, self._awake = (put(np.arange(coupled.worlds * bodies)) for _ in range(2))
         self._any = put(np.zeros(coupled.worlds))
-        self._where, self._width = (chains.where, chains.width) if chains else (put([]), 1)
+        self._where, self._width = (chains.paths.where, chains.paths.width) if chains else (put([]), 1)
         made = resting_kernels(coupled.real, linear, device_arrays.serial(coupled.device))
         self._begin, self._look, self._join, self._wake, self._settle, self._leave = self.kernels = made
 
