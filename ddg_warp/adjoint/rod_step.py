@@ -207,7 +207,8 @@ class RodStepAdjoint:
             self._launch(self._frame, [after.x, kept.frame, group.count, by_frame], [window, lagged])
         if kind.twist or kind.viscous:
             self._launch(self._ends, [window, group.count], [self._end])
-        end = [cotangent.x, cotangent.v, cotangent.theta, cotangent.omega, self._end]
+        motion, inertia = step.motion_type(kind.dim, self.real), step.inertia_type(kind.dim, self.real)
+        end = [_filled(motion, cotangent), self._end]
         read = [*end, group.fixed, group.mass, group.rotary, group.count, self._rate]
         self._launch(self._solution, read, [self._dof, self._right])
         resisted = self.drag and (self.drag, before, tangents)
@@ -234,23 +235,9 @@ class RodStepAdjoint:
             self.followers.vjp(predictor.x, *w, predictor.by_x[: kind.dim])
         if predictor:
             predictor.vjp(before, self._nodes, window, self._dof, start, inputs.rate)
-        self._launch(
-            self._start,
-            [*end, kept.x, kept.theta, before.x, before.v, before.theta, before.omega, inputs.load, self._dof]
-            + [
-                group.mass,
-                group.rotary,
-                group.fixed,
-                self._moved,
-                group.count,
-                self._rate,
-                self._damping,
-                self.gravity,
-                group.world,
-            ],
-            [start.x, start.v, start.theta, start.omega, inputs.mass, inputs.rotary, inputs.rate, inputs.damping]
-            + [inputs.gravity],
-        )
+        read = [*end, kept.x, kept.theta, _filled(motion, before), inputs.load, self._dof, group.mass, group.rotary]
+        read += [group.fixed, self._moved, group.count, self._rate, self._damping, self.gravity, group.world]
+        self._launch(self._start, read, [_filled(motion, start), _filled(inertia, inputs)])
         return start, inputs
 
     @property
@@ -284,3 +271,11 @@ def _moved(group) -> np.ndarray:
     for place in host.turning[:, 0] - host.nodes:
         moved[place // rods, place % rods] |= 1 << group.kind.dim
     return moved
+
+
+def _filled(struct_type, values):
+    """Return a struct with the arrays of `values` by name."""
+    struct = struct_type()
+    for name in struct_type.vars:
+        setattr(struct, name, getattr(values, name))
+    return struct

@@ -18,6 +18,37 @@ from ddg_warp.kernels.forces.prescribed_motion import functions, reached_functio
 
 
 @cache
+def motion_type(dim: int, real):
+    """Return the struct of positions, angles and their rates of rods, or of gradients by them."""
+    V = wp.types.vector(dim, real)
+
+    @wp.struct
+    class Motion:
+        x: wp.array2d(dtype=V)
+        v: wp.array2d(dtype=V)
+        theta: wp.array2d(dtype=real)
+        omega: wp.array2d(dtype=real)
+
+    return Motion
+
+
+@cache
+def inertia_type(dim: int, real):
+    """Return the struct of gradients by masses, and by rate, damping and gravity per node."""
+    V = wp.types.vector(dim, real)
+
+    @wp.struct
+    class Inertia:
+        mass: wp.array2d(dtype=real)
+        rotary: wp.array2d(dtype=real)
+        rate: wp.array2d(dtype=real)
+        damping: wp.array2d(dtype=real)
+        gravity: wp.array2d(dtype=V)
+
+    return Inertia
+
+
+@cache
 def step_kernels(kind: RodKind, real, midpoint: bool, more_to_start: bool):
     """Build the kernels of the end update and of inertia.
 
@@ -29,16 +60,13 @@ def step_kernels(kind: RodKind, real, midpoint: bool, more_to_start: bool):
     """
     dim, twist = kind.dim, kind.twist
     settles = kind.drag and midpoint  # velocities of massless dofs are means over the step; see `drag.rod_kernels`
-    V = wp.types.vector(dim, real)
+    V, Motion, Inertia = wp.types.vector(dim, real), motion_type(dim, real), inertia_type(dim, real)
     end_weight = real(2.0 if midpoint else 1.0)  # derivative of the end by the solution
     start_weight = real(1.0 if midpoint else 0.0)  # derivative of the end by minus the start
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def solution(
-        x: wp.array2d(dtype=V),
-        v: wp.array2d(dtype=V),
-        theta: wp.array2d(dtype=real),
-        omega: wp.array2d(dtype=real),
+        by_end: Motion,
         more: wp.array3d(dtype=real),
         fixed: wp.array2d(dtype=wp.uint8),
         mass: wp.array2d(dtype=real),
@@ -56,7 +84,7 @@ def step_kernels(kind: RodKind, real, midpoint: bool, more_to_start: bool):
         swing = end_weight
         if wp.static(settles):
             swing = wp.where(mass[k, r] <= real(0.0), real(1.0), end_weight)
-        total = x[k, r] * end_weight + v[k, r] * (rate[r] * swing)
+        total = by_end.x[k, r] * end_weight + by_end.v[k, r] * (rate[r] * swing)
         for d in range(wp.static(dim)):
             gradient = total[d] + end_weight * more[d, k, r]
             dof_out[d, k, r] = gradient
@@ -65,25 +93,20 @@ def step_kernels(kind: RodKind, real, midpoint: bool, more_to_start: bool):
             swing = end_weight
             if wp.static(settles):
                 swing = wp.where(rotary[k, r] <= real(0.0), real(1.0), end_weight)
-            by_angle = end_weight * (theta[k, r] + more[wp.static(dim), k, r]) + swing * omega[k, r] * rate[r]
+            by_angle = (
+                end_weight * (by_end.theta[k, r] + more[wp.static(dim), k, r]) + swing * by_end.omega[k, r] * rate[r]
+            )
             dof_out[wp.static(dim), k, r] = by_angle
             right_out[wp.static(dim), k, r] = wp.where(((mask >> wp.static(dim)) & 1) == 0, by_angle, real(0.0))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def start(
-        # gradients by the end
-        x: wp.array2d(dtype=V),
-        v: wp.array2d(dtype=V),
-        theta: wp.array2d(dtype=real),
-        omega: wp.array2d(dtype=real),
+        by_end: Motion,
         more: wp.array3d(dtype=real),
         # the solution, the start, the adjoint w, and cotangents at fixed dofs
         q: wp.array2d(dtype=V),
         angle: wp.array2d(dtype=real),
-        x0: wp.array2d(dtype=V),
-        v0: wp.array2d(dtype=V),
-        theta0: wp.array2d(dtype=real),
-        omega0: wp.array2d(dtype=real),
+        before: Motion,
         w: wp.array3d(dtype=real),
         cotangent_fixed: wp.array3d(dtype=real),
         mass: wp.array2d(dtype=real),
@@ -95,16 +118,8 @@ def step_kernels(kind: RodKind, real, midpoint: bool, more_to_start: bool):
         damping: wp.array(dtype=real),
         gravity: wp.array(dtype=V),
         world: wp.array(dtype=int),
-        # gradients by the start, by masses, and by rate, damping and gravity per node
-        x_out: wp.array2d(dtype=V),
-        v_out: wp.array2d(dtype=V),
-        theta_out: wp.array2d(dtype=real),
-        omega_out: wp.array2d(dtype=real),
-        mass_out: wp.array2d(dtype=real),
-        rotary_out: wp.array2d(dtype=real),
-        rate_out: wp.array2d(dtype=real),
-        damping_out: wp.array2d(dtype=real),
-        gravity_out: wp.array2d(dtype=V),
+        by_start: Motion,
+        by_inertia: Inertia,
     ):
         """Write gradients by the start and by masses; add to gradients by the rate.
 
@@ -121,33 +136,33 @@ def step_kernels(kind: RodKind, real, midpoint: bool, more_to_start: bool):
         m = mass[k, r]
         w_free = V()
         fixed_at_start = V()
-        by_end = x[k, r]
+        by_x_end = by_end.x[k, r]
         for d in range(wp.static(dim)):
-            by_end[d] = by_end[d] + more[d, k, r]
+            by_x_end[d] = by_x_end[d] + more[d, k, r]
             if ((mask >> d) & 1) == 0:
                 w_free[d] = w[d, k, r]
             elif ((prescribed >> d) & 1) == 0:
                 fixed_at_start[d] = cotangent_fixed[d, k, r]
-        step = q[k, r] - x0[k, r]
-        before = v0[k, r]
-        ended = v[k, r]
+        step = q[k, r] - before.x[k, r]
+        v0 = before.v[k, r]
+        ended = by_end.v[k, r]
         velocity_weight = end_weight
         before_kept = start_weight
         if wp.static(settles):
             if m <= real(0.0):
                 velocity_weight = real(1.0)
                 before_kept = real(0.0)
-        by_x = w_free * (c * m) + fixed_at_start - by_end * start_weight - ended * (rho * velocity_weight)
+        by_x = w_free * (c * m) + fixed_at_start - by_x_end * start_weight - ended * (rho * velocity_weight)
         by_v = w_free * (rho * m) - ended * before_kept
         if wp.static(more_to_start):
-            by_x += x_out[k, r]
-            by_v += v_out[k, r]
-        x_out[k, r] = by_x
-        v_out[k, r] = by_v
-        mass_out[k, r] = wp.dot(w_free, gravity[world[r]] - step * c + before * rho)
-        gravity_out[k, r] = w_free * m
+            by_x += by_start.x[k, r]
+            by_v += by_start.v[k, r]
+        by_start.x[k, r] = by_x
+        by_start.v[k, r] = by_v
+        by_inertia.mass[k, r] = wp.dot(w_free, gravity[world[r]] - step * c + v0 * rho)
+        by_inertia.gravity[k, r] = w_free * m
         grad_inverse_step = velocity_weight * wp.dot(ended, step) - m * wp.dot(
-            w_free, step * (real(2.0) * rho + alpha) - before
+            w_free, step * (real(2.0) * rho + alpha) - v0
         )
         by_damping = -m * rho * wp.dot(w_free, step)
         if wp.static(twist):
@@ -158,28 +173,28 @@ def step_kernels(kind: RodKind, real, midpoint: bool, more_to_start: bool):
             elif ((prescribed >> wp.static(dim)) & 1) == 0:
                 angle_at_start = cotangent_fixed[wp.static(dim), k, r]
             j = rotary[k, r]
-            rotation = angle[k, r] - theta0[k, r]
-            spin = omega0[k, r]
-            spun = omega[k, r]
+            rotation = angle[k, r] - before.theta[k, r]
+            spin = before.omega[k, r]
+            spun = by_end.omega[k, r]
             velocity_weight = end_weight
             before_kept = start_weight
             if wp.static(settles):
                 if j <= real(0.0):
                     velocity_weight = real(1.0)
                     before_kept = real(0.0)
-            by_end_angle = theta[k, r] + more[wp.static(dim), k, r]
+            by_end_angle = by_end.theta[k, r] + more[wp.static(dim), k, r]
             by_angle = free * c * j + angle_at_start - by_end_angle * start_weight - spun * (rho * velocity_weight)
             if wp.static(more_to_start):
-                by_angle += theta_out[k, r]
-            theta_out[k, r] = by_angle
-            omega_out[k, r] = free * rho * j - spun * before_kept
-            rotary_out[k, r] = free * (spin * rho - rotation * c)
+                by_angle += by_start.theta[k, r]
+            by_start.theta[k, r] = by_angle
+            by_start.omega[k, r] = free * rho * j - spun * before_kept
+            by_inertia.rotary[k, r] = free * (spin * rho - rotation * c)
             grad_inverse_step += velocity_weight * spun * rotation - j * free * (
                 rotation * (real(2.0) * rho + alpha) - spin
             )
             by_damping -= j * rho * free * rotation
-        rate_out[k, r] = rate_out[k, r] + grad_inverse_step
-        damping_out[k, r] = by_damping
+        by_inertia.rate[k, r] = by_inertia.rate[k, r] + grad_inverse_step
+        by_inertia.damping[k, r] = by_damping
 
     return solution, start
 
