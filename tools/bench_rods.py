@@ -180,7 +180,7 @@ def largest_residual(integrator: ddg.Integrator, state) -> float:
     Their solver keeps the residual before its last update. The evaluation resumes rods that stopped at an earlier state, so call it
     last.
     """
-    worst = [] if integrator._coupled is None else [np.abs(integrator._coupled.newton.rhs.numpy()).max()]
+    worst = [] if integrator._coupled is None else [np.abs(integrator._coupled.newton.system.rhs.numpy()).max()]
     for chain in integrator._chains:
         newton = chain.newton
         newton.islands.status.zero_()

@@ -90,9 +90,7 @@ class CoupledPredictor:
         islands.iterate_action.zero_()
         inputs = [before.q, before.v, fixed, coupled.moves, self._dt, self._none, self._none, *islands.arrays]
         outputs = [iterates.q, iterates.base, iterates.target]
-        device_arrays.sweep(
-            self._begin, coupled.blocks, [*inputs, coupled.blocks], outputs, coupled.device, worlds=coupled.worlds
-        )
+        coupled.sweep(self._begin, [*inputs, coupled.blocks], outputs)
         if self.motion:
             self.motion.place(islands, iterates.q)
         if self._turns:

@@ -306,25 +306,22 @@ class CoupledModel:
         """Update frames and time-lagged data of `state` to iterate q in worlds that `todo` marks; strains stay."""
         self._carry(state, state, q, state, todo, UPDATE_FRAMES, 1)
 
+    def sweep(self, kernel, inputs: list, outputs: list, count: int | None = None) -> None:
+        """Launch a kernel over `count` items of every world, by default its dof blocks; see `device_arrays.sweep`."""
+        count = self.blocks if count is None else count
+        arrays.sweep(kernel, count, inputs, outputs, self.device, worlds=self.worlds)
+
     def _carry(self, before, after, q: wp.array, kept, moved: wp.array, wanted: int, within: int) -> None:
         """Launch the frame and lag kernels of `kernels.elements.coupled_frames`."""
         real, serial = self.real, arrays.serial(self.device)
-
-        def launch(kernel, count, inputs, outputs):
-            arrays.sweep(kernel, count, inputs, outputs, self.device, worlds=self.worlds)
-
-        launch(
-            frames.edge_kernel(real, serial),
-            self.edges,
-            [q, self.ends, self.blocks, moved, wanted, kept.frame, before.frame],
-            [after.frame],
-        )
+        inputs = [q, self.ends, self.blocks, moved, wanted, kept.frame, before.frame]
+        self.sweep(frames.edge_kernel(real, serial), inputs, [after.frame], self.edges)
         for index, (part, same, old, new) in enumerate(zip(self.sets, kept.lag, before.lag, after.lag, strict=True)):
             if part.term.measure.advance:
                 element_inputs = self.elements(after, index, q)
                 element_inputs.lag = old
                 kernel = frames.lag_kernel(part.term.measure, real, serial)
-                launch(kernel, part.elements, [element_inputs, moved, wanted, within, same], [new])
+                self.sweep(kernel, [element_inputs, moved, wanted, within, same], [new], part.elements)
 
     @property
     def carries(self) -> list:

@@ -33,7 +33,7 @@ class PathJoints:
         self._moved = wp.zeros(max(1, worlds * self._rows), dtype=H, device=device)
         self._units = wp.array(np.repeat(plan.units, worlds, axis=1).reshape(-1, 3), dtype=H, device=device)
         self._factors = wp.zeros((3, max(1, worlds * self.count)), dtype=M, device=device)
-        self._responses = paths.allocate(plan.block, linear, plan.solves)
+        self._responses = paths.allocate(plan.block, linear, len(plan.units))
         self._load, self._follow, self._finish = kernels
         self._measure, self._meet = joint_schur.joint_kernels(linear) if self.count else (None, None)
 

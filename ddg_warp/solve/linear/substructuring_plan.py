@@ -256,9 +256,9 @@ class SubstructuringPlan:
         alone = np.unique(chain * colours + self.colour[joint]).size == chain.size
         self.met = np.where(self.chain >= 0, joints_of[:, self.chain], -1) if len(chain) and alone else None
         self.size = 6 if (self.pairs[:, 1] >= 0).any() else 3
-        self.solves = self.size * colours if len(chain) else 0
-        self.units = np.zeros((self.solves, 1, 2 * joints, 3))
-        for m, colour in enumerate(self.colour) if self.solves else ():
+        solves = self.size * colours if len(chain) else 0
+        self.units = np.zeros((solves, 1, 2 * joints, 3))
+        for m, colour in enumerate(self.colour) if solves else ():
             for d in range(self.size):
                 block = self.pairs[m, d // 3]
                 if block >= 0 and not host.fixed[block, d % 3]:

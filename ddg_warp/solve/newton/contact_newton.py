@@ -100,7 +100,7 @@ class NewtonContact:
 
     def lag_again(self, solution: wp.array, iterates, islands) -> None:
         """Update the friction lag at the iterate of converged worlds, and keep that in one of `solutions`."""
-        self._sweep(self._keep_solution, [iterates.q, islands.substep_accepted, self.coupled.blocks], [solution])
+        self.coupled.sweep(self._keep_solution, [iterates.q, islands.substep_accepted, self.coupled.blocks], [solution])
         self.lag(iterates.q, again=True)
         self._launch(self._again, [islands.arrays[0]], [])
 
@@ -147,7 +147,7 @@ class NewtonContact:
         self.pending.land(iterates, system, islands, modes)
         self._limit(iterates, system, islands)
         self.pending.end(iterates, islands)
-        self._sweep(self._differ_gain, [system.rhs, iterates.q, iterates.base, modes, blocks], [self._dots])
+        self.coupled.sweep(self._differ_gain, [system.rhs, iterates.q, iterates.base, modes, blocks], [self._dots])
         self._sum(self._dots, self._gain)
         inputs = [modes, self.search.time, self._gain]
         self._launch(self._expect, inputs, [*islands.arrays, search.stalled, self._projected])
@@ -175,10 +175,6 @@ class NewtonContact:
         if grown:
             self.tally.forget()
         return grown
-
-    def _sweep(self, kernel, inputs: list, outputs: list) -> None:
-        coupled = self.coupled
-        device_arrays.sweep(kernel, coupled.blocks, inputs, outputs, coupled.device, worlds=coupled.worlds)
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         wp.launch(kernel, self.coupled.worlds, inputs, outputs, device=self.coupled.device)

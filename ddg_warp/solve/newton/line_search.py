@@ -66,13 +66,13 @@ class LineSearch:
     def predict_decrease(self, search, system) -> None:
         """Compute the decrease of the energy that directions predict."""
         blocks = self.coupled.blocks
-        self._sweep(self._measure, blocks, [system.rhs, system.direction, system.wanted, blocks], [self._dots])
+        self.coupled.sweep(self._measure, [system.rhs, system.direction, system.wanted, blocks], [self._dots])
         self._sum(self._dots, search.decrease)
 
     def measure_rotation(self, iterates, search, system) -> None:
         """Compute the largest squared rotation of directions with spatial components."""
         inputs = [iterates.q, system.direction, *self._turning, system.wanted, self.coupled.blocks]
-        self._sweep(self._rotate, sum(map(len, self._turning)), inputs, [self._squares])
+        self.coupled.sweep(self._rotate, inputs, [self._squares], sum(map(len, self._turning)))
         self._largest(self._squares, search.rotation)
 
     def take(self, search, system, islands, rotation_cap: float) -> None:
@@ -86,7 +86,4 @@ class LineSearch:
         """Move the iterates by the step, or by the fraction that the line search has left."""
         blocks = self.coupled.blocks
         inputs = [system.direction, islands.step_length, islands.iterate_action, islands.backtracks, blocks]
-        self._sweep(self._move, blocks, inputs, [iterates.base, iterates.q])
-
-    def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
-        device_arrays.sweep(kernel, count, inputs, outputs, self.coupled.device, worlds=self.coupled.worlds)
+        self.coupled.sweep(self._move, inputs, [iterates.base, iterates.q])

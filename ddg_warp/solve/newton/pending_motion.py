@@ -53,29 +53,27 @@ class PendingMotion:
     def end(self, iterates, islands) -> None:
         """Reset the target to the iterate in worlds without pending motion."""
         self._any.zero_()
-        self._sweep(self._end, [iterates.q, islands.arrays[0], self.coupled.blocks], [iterates.proposed, self._any])
+        self.coupled.sweep(
+            self._end, [iterates.q, islands.arrays[0], self.coupled.blocks], [iterates.proposed, self._any]
+        )
 
     def approach(self, iterates, system, terms) -> None:
         """Subtract the resistance of a `ContactPotential` against pending motion from the residual."""
         blocks, fixed, wanted = self.coupled.blocks, system.masks.fixed, system.wanted
 
         def approach() -> None:
-            self._sweep(self._find_rest, [iterates.q, iterates.proposed, wanted, blocks], [self._rest])
+            self.coupled.sweep(self._find_rest, [iterates.q, iterates.proposed, wanted, blocks], [self._rest])
             self._launch(self._push, [self._aims, iterates.q, fixed, wanted, blocks], [self._rest])
             self._product.zero_()
             terms.product(self._rest, self._product)
-            self._sweep(self._lessen, [self._product, fixed, wanted, blocks], [system.rhs])
+            self.coupled.sweep(self._lessen, [self._product, fixed, wanted, blocks], [system.rhs])
 
         wp.capture_if(self._any, approach)
 
     def follow(self, system) -> None:
         """Add pending motion to the directions."""
         inputs, outputs = [self._rest, system.wanted, self.coupled.blocks], [system.direction]
-        wp.capture_if(self._any, lambda: self._sweep(self._add, inputs, outputs))
-
-    def _sweep(self, kernel, inputs: list, outputs: list) -> None:
-        coupled = self.coupled
-        device_arrays.sweep(kernel, coupled.blocks, inputs, outputs, coupled.device, worlds=coupled.worlds)
+        wp.capture_if(self._any, lambda: self.coupled.sweep(self._add, inputs, outputs))
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         """Launch over the supports of every world, if any."""

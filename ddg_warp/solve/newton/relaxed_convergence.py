@@ -41,6 +41,5 @@ class RelaxedConvergence:
         """Count the bodies of active worlds with a residual ratio above a tolerance."""
         self._out_of_balance.zero_()
         self.number.zero_()
-        coupled, inputs = self.coupled, [ratio, self._owner, self._bodies, rtol, *islands.arrays]
-        outputs = [self._out_of_balance, self.number]
-        device_arrays.sweep(self._count, len(self._owner), inputs, outputs, coupled.device, worlds=coupled.worlds)
+        inputs, outputs = [ratio, self._owner, self._bodies, rtol, *islands.arrays], [self._out_of_balance, self.number]
+        self.coupled.sweep(self._count, inputs, outputs, len(self._owner))

@@ -46,10 +46,10 @@ class StepLimit:
         """Limit the proposed motion from `base` to `q`; `proposed` keeps the proposed end."""
         q, blocks, far = iterates.q, self.coupled.blocks, FAR * self.search.margin
         inputs = [q, iterates.base, self._unit, self.coupled.host.nodes, far, blocks]
-        self._sweep(self._stay, inputs, [self._start, self.modes, iterates.proposed, self._longest])
+        self.coupled.sweep(self._stay, inputs, [self._start, self.modes, iterates.proposed, self._longest])
         shorter = [self.modes, self._longest, self.farthest]
         if self.farthest < math.inf:
-            self._sweep(self._near, [self._start, self._unit, *shorter, blocks], [q])
+            self.coupled.sweep(self._near, [self._start, self._unit, *shorter, blocks], [q])
         self.search.filter(self._start, q, self._unit, self.modes, self._units, self.keep)
         if self.farthest < math.inf:
             self._launch(self._less, shorter, [self.search.time])
@@ -86,10 +86,6 @@ class StepLimit:
             return False
         self.farthest = max(least, min(longest * SHORTER, LONGEST * self.search.margin))
         return True
-
-    def _sweep(self, kernel, inputs: list, outputs: list) -> None:
-        coupled = self.coupled
-        device_arrays.sweep(kernel, coupled.blocks, inputs, outputs, coupled.device, worlds=coupled.worlds)
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         wp.launch(kernel, self.coupled.worlds, inputs, outputs, device=self.coupled.device)

@@ -242,7 +242,7 @@ class CoupledStep(StepDriver):
         iterates, system = solver.iterates, solver.system
         if self.contact:
             self.contact.brace(self.integrator._dt, islands)
-        self._sweep(
+        self.coupled.sweep(
             self._begin,
             [before.q, before.v, system.masks.spatial, coupled.moves]
             + [self.integrator._dt, self.damping, solver.loading.scale, *islands.arrays, coupled.blocks],
@@ -280,7 +280,7 @@ class CoupledStep(StepDriver):
         rate = self.contact.terms.law.rate if self.contact else after.rate
         inputs = [q, before.q, before.v, before.a, self._foresight.predicted, self._foresight.trust, rate]
         outputs = [after.q, after.v, after.a, after.rate]
-        self._sweep(self._finish, [*inputs, *self.islands.arrays, self.coupled.blocks], outputs)
+        self.coupled.sweep(self._finish, [*inputs, *self.islands.arrays, self.coupled.blocks], outputs)
         if self.drag:
             self.drag.settle(before, after, q, self.newton.loading.mass, self.islands)
 
@@ -292,12 +292,6 @@ class CoupledStep(StepDriver):
             self.motion.turn(self.islands, before, after)
         self.field.finish(accepted, before, after)
         self.coupled.update_strains(after)
-
-    def _sweep(self, kernel, inputs: list, outputs: list) -> None:
-        """Launch over the blocks of every world."""
-        device_arrays.sweep(
-            kernel, self.coupled.blocks, inputs, outputs, self.model.wp_device, worlds=self.coupled.worlds
-        )
 
     def _start_frames(self, before):
         """Return the state with the time-lagged data of the solve, carried to the predicted midpoint for the midpoint rule.

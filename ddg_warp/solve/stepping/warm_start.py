@@ -41,14 +41,7 @@ class WarmStart:
         newton, coupled = self.newton, self.newton.coupled
         iterates, system, islands = newton.iterates, newton.system, newton.islands
         inputs = [before.a, system.masks.spatial, *islands.arrays, coupled.blocks]
-        device_arrays.sweep(
-            self._foresee,
-            coupled.blocks,
-            inputs,
-            [iterates.q, self.predicted, system.direction],
-            coupled.device,
-            worlds=coupled.worlds,
-        )
+        coupled.sweep(self._foresee, inputs, [iterates.q, self.predicted, system.direction])
         if newton.turns:
             newton.turns.go_further(before, self.predicted, iterates, system, islands)
 
@@ -68,7 +61,7 @@ class WarmStart:
             nodes,
             coupled.blocks,
         ]
-        device_arrays.sweep(self._weigh, nodes, inputs, [self._weights], coupled.device, worlds=coupled.worlds)
+        coupled.sweep(self._weigh, inputs, [self._weights], nodes)
         self._sum(self._weights.reshape((coupled_warm_start.SUMS * coupled.worlds, -1)), self._sums.flatten())
         inputs = [self._sums, newton.options.rtol, newton.tolerances.total, islands.arrays[1]]
         wp.launch(self._trust, coupled.worlds, inputs, [self.trust], device=coupled.device)
