@@ -75,7 +75,9 @@ def move(result: ContactPotential, positions: wp.array, x: np.ndarray) -> None:
 def state(result: ContactPotential) -> list[np.ndarray]:
     """Return copies of energies, forces and blocks."""
     result.join()
-    return [array.numpy().copy() for array in (result.energy, result.forces, result.diagonal, result.between)]
+    return [
+        array.numpy().copy() for array in (result.energy, result.forces, result.blocks.diagonal, result.blocks.between)
+    ]
 
 
 def hessian_product(result: ContactPotential, v: np.ndarray, positions=None, wanted=None) -> np.ndarray:

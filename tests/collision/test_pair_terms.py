@@ -115,7 +115,7 @@ def test_blocks_equal_the_matrix(device, law):
     largest = np.abs(matrix).max()
     blocks = matrix[np.arange(n), np.arange(n)]
     assert np.abs(diagonal - blocks).max() < 1e-13 * largest
-    assert np.abs(result.stiffness.numpy() - np.trace(blocks, axis1=1, axis2=2)).max() < 1e-13 * largest
+    assert np.abs(result.blocks.stiffness.numpy() - np.trace(blocks, axis1=1, axis2=2)).max() < 1e-13 * largest
     assert np.abs(between - matrix[nodes[:, 0], nodes[:, 1]]).max() < 1e-13 * largest
     assert np.abs(between).max() > 1e-3 * largest
 

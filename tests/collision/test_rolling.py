@@ -234,13 +234,13 @@ def test_blocks_equal_the_matrix(device, form):
     """Blocks are of nodes and angles with themselves, of neighbouring angles, and of edges with both nodes."""
     result, *_ = friction_terms(ROLLING, device, form)
     n, shapes = len(result.forces), result.search.shapes
-    matrix, diagonal = assembled_hessian(result, n).transpose(0, 2, 1, 3), result.diagonal.numpy()
+    matrix, diagonal = assembled_hessian(result, n).transpose(0, 2, 1, 3), result.blocks.diagonal.numpy()
     largest = np.abs(matrix).max(axis=(0, 1, 2, 3))
     flat = matrix.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)
     assert np.abs(flat - flat.T).max() < 1e-14 * largest
     assert np.linalg.eigvalsh(flat).min() > -1e-13 * largest
     result.join()
-    first, second, neighbour = (array.numpy() for array in result.turned)
+    first, second, neighbour = (array.numpy() for array in result.blocks.turned)
     (nodes, *_), angles = shapes.things(2), shapes.angles(2)[:, 0]
     rolling = np.flatnonzero(angles >= 0)
     assert np.abs(first).max() > 1e-3 * largest and np.abs(neighbour).max() > 1e-7 * largest

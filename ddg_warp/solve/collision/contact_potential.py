@@ -10,10 +10,10 @@ import warp as wp
 
 from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError, SolverError
-from ddg_warp.kernels.collision.contact import assembly
 from ddg_warp.kernels.densities import Density
 from ddg_warp.kernels.terms import FRICTION_LAWS
 from ddg_warp.solve.collision.broad_phase import BroadPhase
+from ddg_warp.solve.collision.contact_blocks import ContactBlocks
 from ddg_warp.solve.collision.contact_set import ContactSet
 from ddg_warp.solve.collision.friction_set import FrictionSet
 from ddg_warp.solve.collision.hessian_product import PairProduct
@@ -54,13 +54,8 @@ class ContactPotential:
     Attributes:
         energy: (worlds,) [J], of contact and the potential of friction; forces: (worlds times nodes,) [N].
         gap: (worlds,) smallest gap of all candidates [m], at most the reach of the search; touching, dissipated: see `WorldSums`.
-        diagonal: (worlds times nodes,) blocks of the Gauss-Newton matrix at nodes, 3 x 3 [N/m].
-        between: (worlds times edges,) blocks between the first and the second node of edges, in the order of `shapes.things(2)`. A
-            pair contributes the 6 x 6 block of each of its edges to both, positive semi-definite. See `join`.
+        blocks: the `ContactBlocks` of the matrix.
         rolls: whether friction rotates rods.
-        turned: for rolling, blocks of each edge angle with the first and second node [N], and with the angle of the next edge
-            of the rod [N m]. Diagonal blocks of angles are in `diagonal`.
-        stiffness: (worlds times nodes,) [N/m], traces of `diagonal`.
         start: positions and angles at the start of slip (worlds times nodes,), unless given to `evaluate`.
         more: addition to normal forces in friction (worlds,) [N], zero except for forced sticking.
         law: `law_struct`, on the device, with rates of inertia (worlds,) [1/s], initially zero; lag_law: law of the last friction lag.
@@ -106,13 +101,6 @@ class ContactPotential:
         self.gap = wp.zeros(search.worlds, dtype=self.real, device=self.device)
         self._no_rate = wp.zeros_like(self.gap)
         self.forces = wp.zeros(nodes, dtype=wp.types.vector(3, self.real), device=self.device)
-        self.stiffness = wp.zeros(nodes, dtype=self.real, device=self.device)
-        block = wp.types.matrix((3, 3), self.linear)
-        self.diagonal = wp.zeros(nodes, dtype=block, device=self.device)
-        self.between = wp.zeros(search.worlds * len(self.law.square), dtype=block, device=self.device)
-        self._told, self._told_edges = (
-            wp.zeros(len(array), dtype=wp.uint8, device=self.device) for array in (self.forces, self.between)
-        )
         silenced = np.zeros(len(search.shapes.points), np.uint8)
         silenced[[] if silent is None else silent] = 1
         silenced = wp.array(silenced, dtype=wp.uint8, device=self.device)
@@ -122,13 +110,7 @@ class ContactPotential:
         self.frictions = self._with_friction(rubs, ways, friction_law, velocity, silenced)
         self.start, self.more = wp.zeros_like(self.forces), wp.zeros_like(self.gap)
         self.rolls = any(part.rolls for part in self.frictions)
-        made = assembly.collect_kernels(self.real, self.linear, device_arrays.serial(self.device), self.rolls)
-        self._collect, self._join, self._roll = made
-        edges = len(self.between) if self.rolls else 0
-        types = (*(wp.types.vector(3, self.linear),) * 2, self.linear)
-        self.turned = [wp.zeros(edges, dtype=dtype, device=self.device) for dtype in types]
-        angles = search.shapes.angles(2)[:, 0].astype(np.int32)
-        self._angles = wp.array(angles if self.rolls else angles[:0], dtype=int, device=self.device)
+        self.blocks = ContactBlocks(search, len(self.law.square), self.linear, self.rolls)
         self.products = PairProduct(self._parts, self.law, self.real, self.linear)
         self._rub = PairProduct(self.frictions, self.law, self.real, self.linear) if self.frictions else None
         self._totals = totals = WorldSums(self.lists, self.frictions, search.worlds, self.real, self.device)
@@ -139,12 +121,7 @@ class ContactPotential:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         parts = [kernel for part in self._parts for kernel in part.kernels]
-        kernels = [
-            self._collect,
-            self._join,
-            *([self._roll] if self.rolls else []),
-            *(self.spins.kernels if self.frictions else []),
-        ]
+        kernels = [*self.blocks.kernels, *(self.spins.kernels if self.frictions else [])]
         return [*kernels, *self.products.kernels, *self._totals.kernels, *parts]
 
     @property
@@ -241,8 +218,7 @@ class ContactPotential:
         device_arrays.side_by_side([self._sum_up, partial(self._totals, self.search.overflow)], self.device)
 
     def _sum_up(self) -> None:
-        outputs = [self.forces, self.diagonal, self.stiffness, self._told]
-        device_arrays.sweep(self._collect, len(self.forces), [self.products.sets], outputs, self.device)
+        self.blocks.collect(self.products.sets, self.forces)
 
     def _start_anew(self) -> None:
         """Reset the smallest gaps, and refuse lists that have grown since `fit`."""
@@ -289,13 +265,8 @@ class ContactPotential:
         self.products.settle(v, out, inactive_mask, busy, dots)
 
     def join(self) -> None:
-        """Write `between` and `turned` of the last `evaluate`."""
-        edges = self.search.lists[0].first
-        inputs = [self.products.sets, edges.surface, edges.count]
-        device_arrays.sweep(self._join, len(self.between), inputs, [self.between, self._told_edges], self.device)
-        if self.rolls:
-            inputs = [self.products.sets, self._angles, len(self.search.shapes.points)]
-            device_arrays.sweep(self._roll, len(self.between), inputs, self.turned, self.device)
+        """Assemble the `blocks` between the nodes of edges, of the last `evaluate`."""
+        self.blocks.join(self.products.sets)
 
     def _check(self, rate: wp.array) -> None:
         """Refuse rates of the wrong shape or type, and friction without `lag`."""

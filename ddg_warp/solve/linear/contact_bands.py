@@ -30,7 +30,7 @@ class ContactBands:
         """
         chains = self.chains
         inputs = [chains.bands.blocks, chains.paths.layout, self._ahead, self._edges, flags, chains.coupled.blocks]
-        inputs += [terms.diagonal, terms.between, self._turning, *terms.turned]
+        inputs += [terms.blocks.diagonal, terms.blocks.between, self._turning, *terms.blocks.turned]
         dim = chains.paths.longest, chains.paths.columns
         wp.launch(self._stiffen, dim, inputs, [chains.bands.eliminated], device=chains.device)
 

@@ -17,7 +17,7 @@ class ContactHessian:
     """
 
     def __init__(self, terms, shapes):
-        self._terms, self._shapes, self.diagonal = terms, shapes, terms.diagonal
+        self._terms, self._shapes, self.diagonal = terms, shapes, terms.blocks.diagonal
         self._bands = self._q = self._curved = None
 
     def bind(self, chains) -> None:

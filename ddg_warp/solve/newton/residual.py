@@ -31,7 +31,7 @@ class ResidualAssembler:
         inputs.blocks, inputs.nodes, inputs.rtol, inputs.floor = coupled.blocks, host.nodes, rtol, floor
         inputs.allowed, outputs.least, outputs.ratio = tolerances.blocks, tolerances.least, tolerances.ratio
         if contact:
-            inputs.push, inputs.pressed = contact.forces, contact.stiffness
+            inputs.push, inputs.pressed = contact.forces, contact.blocks.stiffness
         # an array of structures keeps no member alive
         self._meetings = list(_contributions(coupled, elements, sparsity, linear))
         self._sets = wp.array(self._meetings, dtype=coupled_residual.meeting_type(real, linear), device=coupled.device)
