@@ -15,7 +15,7 @@ from ddg_warp.kernels.core.islands import MAX_PROJECTED_ITERATIONS, Islands
 from ddg_warp.kernels.densities import NOT_NEGATIVE, Density, Parameter
 from ddg_warp.kernels.newton.coupled_newton import STALLED, search_kernels
 from ddg_warp.kernels.newton.edge_rotation import STRAIGHT_ROTATION
-from ddg_warp.kernels.stepping.rod_step import advance_kernel
+from ddg_warp.kernels.stepping.time_step import advance_kernel
 
 # The motion.
 

@@ -172,7 +172,7 @@ FAULTS = (
     ),
     Fault(
         "predictor: mass damping dropped from the inertia coefficient",
-        "kernels/stepping/rod_step.py",
+        "kernels/stepping/time_step.py",
         "coefficient = rate * (rate + damping[0])",
         "coefficient = rate * rate",
         ("tests/test_edge_rotation_steps.py", "tests/learn/test_adjoint.py"),

@@ -8,7 +8,7 @@ import warp as wp
 from ddg_warp import device_arrays
 from ddg_warp.kernels.adjoint import coupled_predictor
 from ddg_warp.kernels.core.islands import Islands
-from ddg_warp.kernels.newton import coupled_newton
+from ddg_warp.kernels.stepping import time_step
 from ddg_warp.model.coupled_model import CoupledState
 from ddg_warp.solve.linear.sparse_system import lists
 from ddg_warp.solve.newton.coupled_state import Iterates
@@ -34,7 +34,7 @@ class CoupledPredictor:
         self._iterates = Iterates.of(coupled)
         self.grad_q, self._along = (wp.zeros_like(self._iterates.q) for _ in range(2))
         self.frame, self._lag = coupled.lagged() if self.carries else (None, None)
-        self._begin, _ = coupled_newton.step_kernels(real, midpoint, device_arrays.serial(device))
+        self._begin = time_step.begin_kernel(coupled.nodes, real, midpoint)
         self._unplace, self._pass_on, self._turn, self._vjp = coupled_predictor.predictor_kernels(real, midpoint)
         plan, loops = host.rod_order, np.array([rod.piece.kind.closed for rod in host.rods], int)
         rod = np.repeat(np.arange(len(loops)), np.diff(plan.start))
@@ -86,11 +86,13 @@ class CoupledPredictor:
 
     def find(self, before: CoupledState) -> None:
         """Compute the predictor of a step from the state `before`; launches only."""
-        coupled, iterates, islands, fixed = self.coupled, self._iterates, self._islands, self._system.masks.spatial
+        coupled, iterates, islands = self.coupled, self._iterates, self._islands
         islands.iterate_action.zero_()
-        inputs = [before.q, before.v, fixed, coupled.moves, self._dt, self._none, self._none, *islands.arrays]
-        outputs = [iterates.q, iterates.base, iterates.target]
-        coupled.sweep(self._begin, [*inputs, coupled.blocks], outputs)
+        points, kept = coupled.points, coupled.common(self._system.masks.kept)
+        inputs = [points(before.q), points(before.v), None, None, None, kept, coupled.count, coupled.world]
+        inputs += [self._dt, self._none, self._none, *islands.arrays]
+        written = [points(iterates.q), None, None, points(iterates.base), points(iterates.target), None]
+        self._launch(self._begin, coupled.node_threads, inputs, written)
         if self.motion:
             self.motion.place(islands, iterates.q)
         if self._turns:

@@ -8,7 +8,7 @@ import warp as wp
 from ddg_warp import device_arrays
 from ddg_warp.kernels.adjoint import rod_elements, rod_predictor
 from ddg_warp.kernels.core.islands import Islands
-from ddg_warp.kernels.stepping import rod_step
+from ddg_warp.kernels.stepping import rod_step, time_step
 
 
 class RodPredictor:
@@ -42,7 +42,7 @@ class RodPredictor:
         self._islands.substep_fraction.fill_(1.0)
         self._dt = wp.zeros(model.worlds, dtype=real, device=device)
         self._none = wp.zeros(group.columns, dtype=real, device=device)
-        self._begin = rod_step.begin_kernel(kind, real, midpoint)
+        self._begin = time_step.begin_kernel(kind.nodes, real, midpoint)
         self._carry = rod_elements.frame_kernel(kind, real, unit=False) if self.carries else None
         self._vjp = rod_predictor.predict_kernel(kind, real, midpoint)
 
@@ -81,7 +81,7 @@ class RodPredictor:
             group.node_threads,
             [before.x, before.v, before.theta, before.omega, before.frame, group.fixed, group.count, group.world]
             + [self._dt, self._none, self._none, *islands.arrays],
-            [self.x, self._theta, self.frame, self._target, self._target_angle],
+            [self.x, self._theta, self.frame, None, self._target, self._target_angle],
             device=self.model.wp_device,
         )
         if self.motion:

@@ -8,6 +8,7 @@ import warp as wp
 from ddg_warp import device_arrays as arrays
 from ddg_warp.compile.coupled.system import CoupledSystem, inert_mass
 from ddg_warp.compile.precision import float32_error, stiffnesses
+from ddg_warp.kernels.core.nodes import NodeStorage
 from ddg_warp.kernels.elements import coupled_element as elements
 from ddg_warp.kernels.elements import coupled_frames as frames
 from ddg_warp.kernels.elements import element_path
@@ -148,6 +149,13 @@ class CoupledModel:
                 self.touching[name] = wp.array(tiled, dtype=real, device=device)
         self.moves = wp.array(host.mass + drag_mass, dtype=self.vector, device=device)
         self.ends = wp.array(np.ascontiguousarray(host.ends, np.int32).reshape(-1, 2), dtype=int, device=device)
+        serial = arrays.serial(device)
+        self.nodes, self.node_threads = (
+            NodeStorage(3, False, serial, True),
+            (worlds, arrays.takers(host.blocks, device)),
+        )
+        self.count = wp.full(worlds, host.blocks, dtype=int, device=device)
+        self.world = wp.array(np.arange(worlds), dtype=int, device=device)
         self.still = wp.zeros(worlds, dtype=real, device=device)
         self.every = wp.full(worlds, 1, dtype=int, device=device)
 
@@ -187,23 +195,22 @@ class CoupledModel:
 
     def points(self, blocks: wp.array) -> wp.array:
         """View dof blocks (W N,) as [block][world]."""
-        return blocks.reshape((self.worlds, self.blocks)).transpose((1, 0))
+        size = 3 * wp.types.type_size_in_bytes(self.real)
+        return _view(blocks, self.vector, (self.blocks, self.worlds), (size, size * self.blocks))
+
+    def common(self, values: wp.array) -> wp.array:
+        """View values of dof blocks (N,), the same in all worlds, as [block][world]."""
+        return _view(values, values.dtype, (self.blocks, self.worlds), (*values.strides, 0))
 
     def angles(self, blocks: wp.array) -> wp.array:
         """View the first components (twist angles) of dof blocks (W N,) as [block][world]."""
         size = wp.types.type_size_in_bytes(self.real)
-        shape, strides = (self.blocks, self.worlds), (3 * size, 3 * size * self.blocks)
-        view = wp.array(ptr=blocks.ptr, dtype=self.real, shape=shape, strides=strides, device=self.device)
-        view._ref = blocks  # keeps the memory alive
-        return view
+        return _view(blocks, self.real, (self.blocks, self.worlds), (3 * size, 3 * size * self.blocks))
 
     def components(self, blocks: wp.array) -> wp.array:
         """View dof blocks (W N,) as [component][block][world]."""
         size = wp.types.type_size_in_bytes(self.real)
-        shape, strides = (3, self.blocks, self.worlds), (size, 3 * size, 3 * size * self.blocks)
-        view = wp.array(ptr=blocks.ptr, dtype=self.real, shape=shape, strides=strides, device=self.device)
-        view._ref = blocks
-        return view
+        return _view(blocks, self.real, (3, self.blocks, self.worlds), (size, 3 * size, 3 * size * self.blocks))
 
     def frames(self, frame: wp.array) -> wp.array:
         """View frames (6, W edges) as [component][edge][world]."""
@@ -343,3 +350,10 @@ class CoupledModel:
 def _short(values: np.ndarray) -> np.ndarray:
     """Return one value if all are equal, else the values."""
     return values[:1] if values.size and np.all(values == values.flat[0]) else values
+
+
+def _view(array: wp.array, dtype, shape: tuple[int, ...], strides: tuple[int, ...]) -> wp.array:
+    """View the memory of an array with another type, shape and strides [bytes]."""
+    view = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, strides=strides, device=array.device)
+    view._ref = array  # keeps the memory alive
+    return view

@@ -15,7 +15,7 @@ from ddg_warp.kernels.stepping.rod_step import predicted_function
 
 @cache
 def predict_kernel(kind: RodKind, real, midpoint: bool):
-    """Build the kernel of predictors of `begin_kernel` and `predict_kernel` of `kernels.stepping.rod_step`, one thread a rod.
+    """Build the kernel of predictors of `time_step.begin_kernel` and `rod_step.predict_kernel` of `kernels.stepping`, one thread a rod.
 
     `pull`: add gradients by fixed dofs, by positions and velocities at the start, and by the rate.
 

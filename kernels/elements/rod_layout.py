@@ -14,6 +14,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.core.launch import until_function
+from ddg_warp.kernels.core.nodes import NodeStorage
 from ddg_warp.kernels.elements.element_path import ElementStorage, TermAccess
 from ddg_warp.kernels.measures.bending_second_variation import packed_index
 from ddg_warp.kernels.terms import Term
@@ -35,6 +36,11 @@ class RodKind:
     def key(self) -> tuple:
         """Sort key of kinds."""
         return self.dim, self.twist, self.closed, self.drag, [term.key for term in self.terms]
+
+    @property
+    def nodes(self) -> NodeStorage:
+        """Storage of the nodes."""
+        return NodeStorage(self.dim, self.twist, self.serial)
 
     @property
     def span(self) -> int:

@@ -272,7 +272,7 @@ def grip_kernel(real, arcs: bool):
     ):
         """Write poses; `grips` is the grip of each row, among `count`, -1 for a function of time.
 
-        Worlds whose arcs are not resolved fail; see `kernels.stepping.rod_step.advance_kernel` for `tally`.
+        Worlds whose arcs are not resolved fail; see `kernels.stepping.time_step.advance_kernel` for `tally`.
         """
         n, w = wp.tid()
         if wp.static(arcs):

@@ -12,9 +12,7 @@ from ddg_warp.kernels.core.islands import (
     ANY_NEEDS_DIRECTION,
     BELOW_ROUNDING_FLOOR,
     CCD_LIMITED,
-    COLD_START,
     DOUBTFUL,
-    INVERSE_STEP,
     ITERATE_ACTION,
     ITERATION,
     LOAD_SCALE,
@@ -24,16 +22,12 @@ from ddg_warp.kernels.core.islands import (
     RESIDUAL_NORM_SQ,
     STATUS,
     STEP_LENGTH,
-    STEP_PROGRESS,
     STRAIGHT_ROTATION_LIMIT,
-    SUBSTEP_ACCEPTED,
     SUPPORT_MOTION_PENDING,
-    attempt_functions,
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, items_function, until_function
 from ddg_warp.kernels.newton.line_search import NEED_DIRECTION, STOP, line_search_functions
 from ddg_warp.kernels.newton.rod_iterate import MOVE_STRAIGHT, ROTATE_EDGES
-from ddg_warp.kernels.stepping.rod_warm_start import extrapolation_rate_function
 
 SUPPORTS_MOVING, SUPPORTS_ARRIVED = 2, 1  # supports or predictor obstructed: still moving, arrived in the last update
 POLISH = 1e-3  # largest forcing term of a direction after which a residual may count as rounding
@@ -284,110 +278,6 @@ def freeze_kernel():
             done[w] = 1
 
     return freeze
-
-
-@cache
-def step_kernels(real, midpoint: bool, serial: bool, contact: bool = False):
-    """Build the kernels of a time step; see `kernels.stepping.rod_step` for the schemes.
-
-    `begin`: start a solve from the predictor.
-    `finish`: write the state at the end of the substep.
-    """
-    (length, restart), extrapolation_of = (
-        attempt_functions(real, midpoint),
-        extrapolation_rate_function(real, midpoint, contact),
-    )
-    first_item, until = items_function(serial), until_function(serial)
-    V = wp.types.vector(3, real)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def begin(
-        q0: wp.array(dtype=V),
-        v0: wp.array(dtype=V),
-        fixed: wp.array(dtype=wp.uint8),
-        mass: wp.array(dtype=V),
-        dt: wp.array(dtype=real),
-        damping: wp.array(dtype=real),
-        outer: wp.array(dtype=real),
-        flags: wp.array2d(dtype=int),
-        scalars: wp.array2d(dtype=real),
-        blocks: int,
-        q_out: wp.array(dtype=V),
-        base_out: wp.array(dtype=V),
-        target_out: wp.array(dtype=V),
-    ):
-        """Start a solve from the predictor; massless dofs, without meaningful velocities, start from the last state."""
-        w, start = first_item(wp.tid(), blocks)
-        is_active = scalars[STEP_PROGRESS, w] < real(1.0)
-        if start == 0:
-            flags[SUBSTEP_ACCEPTED, w] = wp.where(is_active, 1, 0)
-        if not is_active:
-            return
-        s = length(scalars, w, dt[w])
-        rate = real(1.0) / s
-        coefficient = rate * (rate + damping[0])
-        if start == 0:
-            restart(flags, scalars, w, rate, coefficient, outer[w])
-        for k in range(start, until(start, blocks)):
-            i = k + w * blocks
-            mask = int(fixed[k])
-            start_q = q0[i]
-            v = v0[i]
-            target_out[i] = start_q + v * (rate / coefficient)
-            if flags[COLD_START, w] == 0:
-                for d in range(3):
-                    if ((mask >> d) & 1) == 0 and mass[k][d] > real(0.0):
-                        start_q[d] = start_q[d] + s * v[d]
-            q_out[i] = start_q
-            base_out[i] = q0[i]
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def finish(
-        q: wp.array(dtype=V),
-        q0: wp.array(dtype=V),
-        v0: wp.array(dtype=V),
-        a0: wp.array(dtype=V),
-        predicted: wp.array(dtype=V),
-        trust: wp.array(dtype=real),
-        rate: wp.array(dtype=real),
-        flags: wp.array2d(dtype=int),
-        scalars: wp.array2d(dtype=real),
-        blocks: int,
-        q_out: wp.array(dtype=V),
-        v_out: wp.array(dtype=V),
-        a_out: wp.array(dtype=V),
-        rate_out: wp.array(dtype=real),
-    ):
-        """Write positions, velocities and accelerations of worlds that converged, and rates of inertia in contact if stored."""
-        w, first = first_item(wp.tid(), blocks)
-        is_active = scalars[STEP_PROGRESS, w] < real(1.0) and flags[STATUS, w] <= wp.static(
-            outcome.CONVERGED_TO_ROUNDING
-        )
-        if first == 0:
-            flags[SUBSTEP_ACCEPTED, w] = wp.where(is_active, 1, 0)
-            if is_active and rate_out.shape[0] > 0:
-                rate_out[w] = rate[w]
-        extrapolation = extrapolation_of(flags, scalars, w) * trust[w]
-        for k in range(first, until(first, blocks)):
-            i = k + w * blocks
-            start = q0[i]
-            v = v0[i]
-            a = a0[i]
-            end = start
-            if is_active:
-                end = q[i]
-                a = (end - predicted[i]) * extrapolation
-                change = (end - start) * scalars[INVERSE_STEP, w]
-                if wp.static(midpoint):
-                    end = real(2.0) * end - start
-                    v = real(2.0) * change - v
-                else:
-                    v = change
-            q_out[i] = end
-            v_out[i] = v
-            a_out[i] = a
-
-    return begin, finish
 
 
 @cache

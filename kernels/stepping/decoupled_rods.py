@@ -25,7 +25,7 @@ from ddg_warp.kernels.core.islands import (
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, first_of, items_function, until_function
 from ddg_warp.kernels.elements.rod_layout import RodKind
-from ddg_warp.kernels.stepping.rod_step import start_function
+from ddg_warp.kernels.stepping.time_step import start_function
 
 # whether the world is stepped so; worst outcome, most iterations and lost pivots of rods, and whether the step is still to be done
 TRIED, WORST, MOST, PIVOTS, LEFT = range(5)
@@ -334,7 +334,7 @@ def world_kernels(real):
 
         Worlds in doubt set `again`, for a search; once `searched`, its result decides. `counts`: see
         `kernels.collision.contact.statistics`, with no
-        active pairs. `tally`, `work`, `rounded`: see `kernels.stepping.rod_step.advance_kernel`.
+        active pairs. `tally`, `work`, `rounded`: see `kernels.stepping.time_step.advance_kernel`.
         """
         w = wp.tid()
         if status[wp.static(LEFT), w] == 0:

@@ -1,5 +1,5 @@
 """Warm start: extrapolate the correction of the last step, an acceleration, from the inertial predictor; see
-`kernels.stepping.rod_step`.
+`kernels.stepping.time_step`.
 
 With implicit Euler the iteration starts at s^2 a from the predictor. The acceleration a is the last solve's correction of its
 predictor over the square of its step, so that constant accelerations are anticipated. With the midpoint rule corrections of stiff

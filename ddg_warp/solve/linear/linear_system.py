@@ -14,12 +14,14 @@ class DofMasks:
     Attributes:
         fixed: (N,) fixed dofs, common to all worlds.
         spatial: (N,) fixed dofs without the skew supports, for predictors: rates along these stay in their planes.
+        kept: (N,) `spatial` and massless dofs without drag, which predictors keep.
         inactive: (W N,) fixed dofs and, in contact, dofs of sleeping islands.
         idle_paths: (columns,) nonzero for rod paths of a `RodSubstructuring` without active dofs.
     """
 
     fixed: wp.array
     spatial: wp.array
+    kept: wp.array
     inactive: wp.array
     idle_paths: wp.array
 
@@ -29,7 +31,8 @@ class DofMasks:
         bits = mask(coupled.host.fixed)
         unskewed = bits.copy()
         unskewed[list(coupled.host.frames)] = 0
-        arrays = bits, unskewed, np.tile(bits, coupled.worlds)
+        kept = unskewed | mask(coupled.moves.numpy() <= 0.0)
+        arrays = bits, unskewed, kept, np.tile(bits, coupled.worlds)
         arrays = (wp.array(values, dtype=wp.uint8, device=coupled.device) for values in arrays)
         return cls(*arrays, wp.zeros(0, dtype=int, device=coupled.device) if idle_paths is None else idle_paths)
 

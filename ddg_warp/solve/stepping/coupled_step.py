@@ -1,4 +1,4 @@
-"""Time step of the coupled system: predictor, prescribed motion, loads, Newton, retries. See `kernels.stepping.rod_step`."""
+"""Time step of the coupled system: predictor, prescribed motion, loads, Newton, retries. See `kernels.stepping.time_step`."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.elements import coupled_frames, element_path
 from ddg_warp.kernels.elements.coupled_element import coupled_storage
-from ddg_warp.kernels.newton import coupled_newton
+from ddg_warp.kernels.stepping import time_step
 from ddg_warp.model.coupled_model import CoupledState
 from ddg_warp.scene import drag
 from ddg_warp.solve.collision.support_arcs import Arcs
@@ -77,9 +77,9 @@ class CoupledStep(StepDriver):
         self._counts = [*self.islands.arrays, self.tally, self.work, self.newton.pcg_work]
         self._kept = [wp.zeros_like(array) for array in self._counts] if solver.contact else []
         self._foresight = WarmStart(solver)
-        self._begin, self._finish = coupled_newton.step_kernels(
-            real, self.midpoint, device_arrays.serial(model.wp_device), solver.contact is not None
-        )
+        nodes = model.coupled.nodes
+        self._begin = time_step.begin_kernel(nodes, real, self.midpoint)
+        self._finish = time_step.finish_kernel(nodes, real, self.midpoint, solver.contact is not None)
         if solver.contact and self.midpoint:
             raise SceneError(
                 "contact: by the midpoint rule steps overshoot equilibrium and end in overlaps; use 'implicit_euler'"
@@ -239,14 +239,16 @@ class CoupledStep(StepDriver):
     def predict(self, before):
         """Launch the predictor, with supports at their prescribed positions; return the state of `_start_frames`."""
         coupled, solver, islands = self.coupled, self.newton, self.islands
-        iterates, system = solver.iterates, solver.system
+        iterates, system, points = solver.iterates, solver.system, coupled.points
         if self.contact:
             self.contact.brace(self.integrator._dt, islands)
-        self.coupled.sweep(
+        wp.launch(
             self._begin,
-            [before.q, before.v, system.masks.spatial, coupled.moves]
-            + [self.integrator._dt, self.damping, solver.loading.scale, *islands.arrays, coupled.blocks],
-            [iterates.q, iterates.base, iterates.target],
+            coupled.node_threads,
+            [points(before.q), points(before.v), None, None, None, coupled.common(system.masks.kept), coupled.count]
+            + [coupled.world, self.integrator._dt, self.damping, solver.loading.scale, *islands.arrays],
+            [points(iterates.q), None, None, points(iterates.base), points(iterates.target), None],
+            device=self.model.wp_device,
         )
         if self.motion:
             self.motion.place(islands, iterates.q)
@@ -275,12 +277,18 @@ class CoupledStep(StepDriver):
 
     def finish(self, before, after) -> None:
         """Launch positions and rates at the end of accepted substeps."""
-        q = self.newton.iterates.q
+        coupled, points, q = self.coupled, self.coupled.points, self.newton.iterates.q
         self._foresight.weigh(before)
         rate = self.contact.terms.law.rate if self.contact else after.rate
-        inputs = [q, before.q, before.v, before.a, self._foresight.predicted, self._foresight.trust, rate]
-        outputs = [after.q, after.v, after.a, after.rate]
-        self.coupled.sweep(self._finish, [*inputs, *self.islands.arrays, self.coupled.blocks], outputs)
+        wp.launch(
+            self._finish,
+            coupled.node_threads,
+            [points(q), None, points(before.q), points(before.v), None, None, points(before.a), None]
+            + [points(self._foresight.predicted), None, self._foresight.trust, rate, coupled.count]
+            + self.islands.arrays,
+            [points(after.q), points(after.v), None, None, points(after.a), None, after.rate],
+            device=self.model.wp_device,
+        )
         if self.drag:
             self.drag.settle(before, after, q, self.newton.loading.mass, self.islands)
 

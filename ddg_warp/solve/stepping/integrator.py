@@ -376,7 +376,7 @@ class Integrator:
         return self._chains if self._coupled is None else [*self._chains, self._coupled]
 
     def _solved(self, dt: float) -> float:
-        """Return the length [s] of the implicit Euler step solved in a step of dt; see `kernels.stepping.rod_step`."""
+        """Return the length [s] of the implicit Euler step solved in a step of dt; see `kernels.stepping.time_step`."""
         return 0.5 * dt if self.scheme == "implicit_midpoint" else dt
 
     def _weigh(self, dt: float, state: State) -> None:

@@ -1,4 +1,4 @@
-"""Time step of a rod group: predictor, prescribed motion and loads, Newton, end update. See `kernels.stepping.rod_step`."""
+"""Time step of a rod group: predictor, prescribed motion and loads, Newton, end update. See `kernels.stepping.time_step`."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from ddg_warp.compile.precision import largest_carried
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.rod_layout import rod_storage
-from ddg_warp.kernels.stepping import rod_step, rod_warm_start
+from ddg_warp.kernels.stepping import rod_step, rod_warm_start, time_step
 from ddg_warp.solve.forces.control_loads import ControlledLoads, RodScale
 from ddg_warp.solve.forces.drag import RodGroupDrag
 from ddg_warp.solve.forces.loads import Loads
@@ -37,11 +37,11 @@ class RodStep(StepDriver):
         super().__init__(integrator, model, _newton(model, group, integrator, means), means, counts_of)
         self.group = group
         kind, real = group.kind, model.types.real
-        self._begin = rod_step.begin_kernel(kind, real, self.midpoint)
+        self._begin = time_step.begin_kernel(kind.nodes, real, self.midpoint)
         self._foresee = rod_warm_start.warm_start_kernel(kind, real, self.newton.linear)
         predicted = ((array.shape, array.dtype, model.wp_device) for array in (self.newton.x, self.newton.theta))
         self._predicted, self._predicted_angle = (device_arrays.allocate(*layout) for layout in predicted)
-        self._nodes = rod_step.finish_nodes_kernel(kind, real, self.midpoint)
+        self._nodes = time_step.finish_kernel(kind.nodes, real, self.midpoint)
         self._frames = rod_step.finish_frames_kernel(kind, real) if kind.twist else None
         self.outer = group.outer
         if (controls := integrator.given) is not None:
@@ -67,7 +67,7 @@ class RodStep(StepDriver):
             group.node_threads,
             [before.x, before.v, before.theta, before.omega, before.frame, group.fixed, group.count, group.world]
             + [self.integrator._dt, self.damping, self.outer, *self.islands.arrays],
-            [newton.x, newton.theta, newton.frame, newton.target, newton.target_angle],
+            [newton.x, newton.theta, newton.frame, None, newton.target, newton.target_angle],
         )
         if self.motion:
             self.motion.place(self.islands, newton.x)
@@ -106,8 +106,8 @@ class RodStep(StepDriver):
             self._nodes,
             group.node_threads,
             [newton.x, newton.theta, before.x, before.v, before.theta, before.omega, before.a, before.alpha]
-            + [self._predicted, self._predicted_angle, group.count, *self.islands.arrays],
-            [after.x, after.v, after.theta, after.omega, after.a, after.alpha],
+            + [self._predicted, self._predicted_angle, None, None, group.count, *self.islands.arrays],
+            [after.x, after.v, after.theta, after.omega, after.a, after.alpha, None],
         )
         if self.drag:
             self.drag.settle(before, after, newton, self.islands)

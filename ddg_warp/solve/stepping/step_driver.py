@@ -13,7 +13,7 @@ from ddg_warp.geometry import polyline
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.islands import LEAST, MAX_PROJECTED_ITERATIONS
 from ddg_warp.kernels.newton.line_search import ROUNDED
-from ddg_warp.kernels.stepping import rod_step as step
+from ddg_warp.kernels.stepping import time_step as step
 from ddg_warp.solve.forces.prescribed_motion import jump_between
 from ddg_warp.timers import timer
 
@@ -51,7 +51,7 @@ def choose_solver(precision: str, before: LinearSolverChoice, errors: float, spl
 
 
 class StepDriver:
-    """Stepper of all islands of a solver, with retries per island; see `kernels.stepping.rod_step`.
+    """Stepper of all islands of a solver, with retries per island; see `kernels.stepping.time_step`.
 
     A step is `step`: attempts (`attempt`), each with one solve, until every island has finished the step or failed. An iteration of
     the solve is `RodNewton.iterate` or `CoupledNewton.iterate`.
@@ -70,7 +70,7 @@ class StepDriver:
         energy, motion, loads, field, drag, contact: energy watch, motion of supports, loads in time, magnetic field, drag, contact;
             None without.
         rounded: outcome of solves that end by rounding.
-        tally, work: counts of outcomes and of work; see `kernels.stepping.rod_step.advance_kernel`.
+        tally, work: counts of outcomes and of work; see `kernels.stepping.time_step.advance_kernel`.
     """
 
     energy = motion = loads = field = drag = contact = None

@@ -1,0 +1,321 @@
+"""Time step around Newton's method: begin, end update, retry with smaller substeps; of uncoupled rods and of the coupled system.
+
+Both schemes solve one implicit Euler step of length s (s = h, or h/2 for the implicit midpoint rule):
+
+    m (x - x_n - s v_n) / s^2 + alpha m (x - x_n) / s + dE/dx = 0,
+
+so that inertia and mass-proportional damping alpha are one quadratic, coefficient * m |x - target|^2 / 2. The midpoint rule then
+extrapolates, x_n+1 = 2 x - x_n and v_n+1 = 2 (x - x_n) / s - v_n.
+
+Newton's method starts from the predictor, x_n + s v_n with rotated edges, plus a warm start: see `kernels.stepping.rod_warm_start`.
+
+An island whose solve fails first repeats it with a cold start from x_n, then halves the substep (`substep_fraction`), each on its own.
+`step_progress` is the completed fraction of the step; both are multiples of powers of two, and exact. With large rotations of
+prescribed motions, substeps are at most `substep`, and each is retried as a step is (`solve.collision.support_arcs`).
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.core import outcome
+from ddg_warp.kernels.core.islands import (
+    COLD_START,
+    FAILURE_STATUS,
+    INVERSE_STEP,
+    ITERATION,
+    LOST_PIVOTS_TOTAL,
+    PROJECTED_ITERATIONS,
+    PROJECTED_LIMIT,
+    RETRIES,
+    ROTATE_PREDICTOR,
+    STATUS,
+    STEP_PROGRESS,
+    STRAIGHT_ROTATION_LIMIT,
+    SUBSTEP,
+    SUBSTEP_ACCEPTED,
+    SUBSTEP_FRACTION,
+    attempt_functions,
+)
+from ddg_warp.kernels.core.launch import CPU_OPTIONS
+from ddg_warp.kernels.core.nodes import NodeStorage
+from ddg_warp.kernels.stepping.rod_warm_start import extrapolation_rate_function
+
+
+@cache
+def begin_kernel(nodes: NodeStorage, real, midpoint: bool):
+    """Build the kernel of predictors.
+
+    `begin`: write predictor, target of inertia and lagged frames, and restart the solve of every island that still has to move.
+
+    Dofs in the mask `kept` start from the last state. These are fixed dofs and, in the coupled system, massless dofs, whose velocities
+    have no meaning. The flag `rotate_predictor` is set for rods; in the coupled system `kernels.newton.coupled_edge_rotation` tests
+    edges, from `base`, the last state.
+    """
+    length, restart = attempt_functions(real, midpoint)
+    dim, twist, coupled = nodes.dim, nodes.twist, nodes.coupled
+    V, (items, until) = wp.types.vector(dim, real), nodes.thread_functions
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def begin(
+        x0: wp.array2d(dtype=V),
+        v0: wp.array2d(dtype=V),
+        theta0: wp.array2d(dtype=real),
+        omega0: wp.array2d(dtype=real),
+        frame0: wp.array3d(dtype=real),
+        kept: wp.array2d(dtype=wp.uint8),
+        count: wp.array(dtype=int),
+        world: wp.array(dtype=int),
+        dt: wp.array(dtype=real),
+        damping: wp.array(dtype=real),
+        outer: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        x_out: wp.array2d(dtype=V),
+        theta_out: wp.array2d(dtype=real),
+        frame_out: wp.array3d(dtype=real),
+        base_out: wp.array2d(dtype=V),
+        target_out: wp.array2d(dtype=V),
+        target_angle_out: wp.array2d(dtype=real),
+    ):
+        i, j = wp.tid()
+        island, first = items(i, j)
+        n = count[island]
+        moves = scalars[STEP_PROGRESS, island] < real(1.0)
+        if first == 0:
+            flags[SUBSTEP_ACCEPTED, island] = wp.where(moves, 1, 0)
+        if not moves or first >= n:
+            return
+        s = length(scalars, island, dt[world[island]])
+        rate = real(1.0) / s
+        coefficient = rate * (rate + damping[0])
+        straight = scalars[STRAIGHT_ROTATION_LIMIT, island]
+        if first == 0:
+            if wp.static(not coupled):
+                if straight == real(0.0):
+                    flags[ROTATE_PREDICTOR, island] = 1
+            restart(flags, scalars, island, rate, coefficient, outer[island])
+        predict_length = wp.where(flags[COLD_START, island] == 0, s, real(0.0))
+        for k in range(first, until(first, n)):
+            mask = int(kept[k, island])
+            start = x0[k, island]
+            v = v0[k, island]
+            target_out[k, island] = start + v * (rate / coefficient)
+            predicted = start
+            for d in range(wp.static(dim)):
+                if ((mask >> d) & 1) == 0:
+                    predicted[d] = predicted[d] + predict_length * v[d]
+            x_out[k, island] = predicted
+            if wp.static(coupled):
+                base_out[k, island] = start
+            else:
+                if flags[COLD_START, island] == 0 and k + 1 < n:
+                    edge_change = (v0[k + 1, island] - v) * s
+                    edge = x0[k + 1, island] - start
+                    if wp.length_sq(edge_change) > straight * straight * wp.length_sq(edge):
+                        flags[ROTATE_PREDICTOR, island] = 1
+            if wp.static(twist):
+                angle = theta0[k, island]
+                spin = omega0[k, island]
+                target_angle_out[k, island] = angle + spin * (rate / coefficient)
+                if ((mask >> wp.static(dim)) & 1) == 0:
+                    angle += predict_length * spin
+                theta_out[k, island] = angle
+                for c in range(7):
+                    frame_out[c, k, island] = frame0[c, k, island]
+
+    return begin
+
+
+@cache
+def start_function(real):
+    """Return the device function `start(flags, scalars, i)`: start a step of an island.
+
+    The step is complete at once if the island has failed for good.
+    """
+
+    @wp.func
+    def start(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), i: int):
+        scalars[SUBSTEP_FRACTION, i] = scalars[SUBSTEP, i]
+        flags[COLD_START, i] = 0
+        flags[RETRIES, i] = 0
+        scalars[STEP_PROGRESS, i] = wp.where(flags[STATUS, i] == wp.static(outcome.STEP_FAILED), real(1.0), real(0.0))
+
+    return start
+
+
+@cache
+def start_kernel(real):
+    """Build the kernel `start`: start a step of all islands."""
+    start_one = start_function(real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def start(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real)):
+        start_one(flags, scalars, wp.tid())
+
+    return start
+
+
+@cache
+def finish_kernel(nodes: NodeStorage, real, midpoint: bool, contact: bool = False):
+    """Build the kernel of the end update.
+
+    `finish`: write positions, twist angles, velocities and accelerations at the end of the substep of islands that converged.
+
+    In the coupled system `trust` scales accelerations, and the rate of inertia in contact is stored if `rate_out` has entries.
+    `contact`: see `crowd` of `extrapolation_rate_function`.
+    """
+    twist, coupled, extrapolation_of = nodes.twist, nodes.coupled, extrapolation_rate_function(real, midpoint, contact)
+    V, (items, until) = wp.types.vector(nodes.dim, real), nodes.thread_functions
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def finish(
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        x0: wp.array2d(dtype=V),
+        v0: wp.array2d(dtype=V),
+        theta0: wp.array2d(dtype=real),
+        omega0: wp.array2d(dtype=real),
+        a0: wp.array2d(dtype=V),
+        alpha0: wp.array2d(dtype=real),
+        predicted: wp.array2d(dtype=V),
+        predicted_angle: wp.array2d(dtype=real),
+        trust: wp.array(dtype=real),
+        rate: wp.array(dtype=real),
+        count: wp.array(dtype=int),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        x_out: wp.array2d(dtype=V),
+        v_out: wp.array2d(dtype=V),
+        theta_out: wp.array2d(dtype=real),
+        omega_out: wp.array2d(dtype=real),
+        a_out: wp.array2d(dtype=V),
+        alpha_out: wp.array2d(dtype=real),
+        rate_out: wp.array(dtype=real),
+    ):
+        i, j = wp.tid()
+        island, first = items(i, j)
+        n = count[island]
+        if first >= n:
+            return
+        moves = scalars[STEP_PROGRESS, island] < real(1.0) and flags[STATUS, island] <= wp.static(
+            outcome.CONVERGED_TO_ROUNDING
+        )
+        if first == 0:
+            flags[SUBSTEP_ACCEPTED, island] = wp.where(moves, 1, 0)
+            if wp.static(coupled):
+                if moves and rate_out.shape[0] > 0:
+                    rate_out[island] = rate[island]
+        extrapolation = extrapolation_of(flags, scalars, island)
+        if wp.static(coupled):
+            extrapolation *= trust[island]
+        for k in range(first, until(first, n)):
+            before = x0[k, island]
+            v = v0[k, island]
+            a = a0[k, island]
+            angle0 = real(0.0)
+            spin = real(0.0)
+            alpha = real(0.0)
+            if wp.static(twist):
+                angle0 = theta0[k, island]
+                spin = omega0[k, island]
+                alpha = alpha0[k, island]
+            end = before
+            angle = angle0
+            if moves:
+                end = x[k, island]
+                a = (end - predicted[k, island]) * extrapolation
+                change = (end - before) * scalars[INVERSE_STEP, island]
+                if wp.static(midpoint):
+                    end = real(2.0) * end - before
+                    v = real(2.0) * change - v
+                else:
+                    v = change
+                if wp.static(twist):
+                    angle = theta[k, island]
+                    alpha = (angle - predicted_angle[k, island]) * extrapolation
+                    spin_mean = (angle - angle0) * scalars[INVERSE_STEP, island]
+                    if wp.static(midpoint):
+                        angle = real(2.0) * angle - angle0
+                        spin = real(2.0) * spin_mean - spin
+                    else:
+                        spin = spin_mean
+            x_out[k, island] = end
+            v_out[k, island] = v
+            a_out[k, island] = a
+            if wp.static(twist):
+                theta_out[k, island] = angle
+                omega_out[k, island] = spin
+                alpha_out[k, island] = alpha
+
+    return finish
+
+
+@cache
+def advance_kernel(real):
+    """Build the kernel of step control.
+
+    `advance`: count the outcome of a substep, and continue (with longer substeps again), retry, or end as failed.
+
+    `tally`: counts of outcomes by code, with `rounded` for solves that converged to rounding. `work`: Newton iterations (sum, largest),
+    solves, retries, lost pivots.
+    """
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def advance(
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        retry_limit: int,
+        smallest: real,
+        rounded: int,
+        tally: wp.array(dtype=wp.int64),
+        work: wp.array(dtype=wp.int64),
+        remaining: wp.array(dtype=int),
+    ):
+        r = wp.tid()
+        if scalars[STEP_PROGRESS, r] >= real(1.0):
+            return
+        result = flags[STATUS, r]
+        counted = result
+        if result == wp.static(outcome.CONVERGED_TO_ROUNDING):
+            counted = rounded
+        wp.atomic_add(tally, counted, wp.int64(1))
+        wp.atomic_add(work, 0, wp.int64(flags[ITERATION, r]))
+        wp.atomic_max(work, 1, wp.int64(flags[ITERATION, r]))
+        wp.atomic_add(work, 2, wp.int64(1))
+        if flags[LOST_PIVOTS_TOTAL, r] > 0:
+            wp.atomic_add(work, 4, wp.int64(flags[LOST_PIVOTS_TOTAL, r]))
+        if result <= wp.static(outcome.CONVERGED_TO_ROUNDING):
+            scalars[STEP_PROGRESS, r] = scalars[STEP_PROGRESS, r] + scalars[SUBSTEP_FRACTION, r]
+            flags[COLD_START, r] = 0
+            if scalars[STEP_PROGRESS, r] < real(1.0):
+                flags[RETRIES, r] = 0
+            # double the substep if it starts at a multiple of its length, so that all islands end together
+            longer = real(2.0) * scalars[SUBSTEP_FRACTION, r]
+            if (
+                scalars[STEP_PROGRESS, r] < real(1.0)
+                and longer <= scalars[SUBSTEP, r]
+                and wp.floor(scalars[STEP_PROGRESS, r] / longer) * longer == scalars[STEP_PROGRESS, r]
+            ):
+                scalars[SUBSTEP_FRACTION, r] = longer
+        else:
+            wp.atomic_add(work, 3, wp.int64(1))
+            flags[RETRIES, r] = flags[RETRIES, r] + 1
+            # a cold start would lead to the same step with its energy drift, or to the same minimum
+            again = (
+                result != wp.static(outcome.ENERGY_DRIFT)
+                and flags[PROJECTED_ITERATIONS, r] <= flags[PROJECTED_LIMIT, r]
+            )
+            if again and flags[COLD_START, r] == 0:
+                flags[COLD_START, r] = 1
+            else:
+                flags[COLD_START, r] = 0
+                scalars[SUBSTEP_FRACTION, r] = real(0.5) * scalars[SUBSTEP_FRACTION, r]
+            if flags[RETRIES, r] > retry_limit or scalars[SUBSTEP_FRACTION, r] < smallest * scalars[SUBSTEP, r]:
+                flags[FAILURE_STATUS, r] = result
+                flags[STATUS, r] = wp.static(outcome.STEP_FAILED)
+                scalars[STEP_PROGRESS, r] = real(1.0)
+        if scalars[STEP_PROGRESS, r] < real(1.0):
+            remaining[0] = 1
+
+    return advance
