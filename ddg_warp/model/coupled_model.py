@@ -23,7 +23,7 @@ class CoupledState:
 
     Attributes:
         q, v: blocks (W N,) of positions [m], twist angles and rotation vectors since the last step [rad], and their rates.
-        a: accelerations of blocks (W N,) for the warm start; see `RodGroupState` and `kernels.stepping.coupled_warm_start`.
+        a: accelerations of blocks (W N,) for the warm start; see `RodGroupState` and `kernels.stepping.warm_start`.
         frame: director and tangent of rod edges (6, W edges).
         lag: time-lagged rows of each element set (rows, W E).
         last: strains of each damped set at this state.
@@ -209,8 +209,9 @@ class CoupledModel:
 
     def components(self, blocks: wp.array) -> wp.array:
         """View dof blocks (W N,) as [component][block][world]."""
-        size = wp.types.type_size_in_bytes(self.real)
-        return _view(blocks, self.real, (3, self.blocks, self.worlds), (size, 3 * size, 3 * size * self.blocks))
+        scalar = blocks.dtype._wp_scalar_type_
+        size = wp.types.type_size_in_bytes(scalar)
+        return _view(blocks, scalar, (3, self.blocks, self.worlds), (size, 3 * size, 3 * size * self.blocks))
 
     def frames(self, frame: wp.array) -> wp.array:
         """View frames (6, W edges) as [component][edge][world]."""

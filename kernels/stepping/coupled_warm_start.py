@@ -1,4 +1,4 @@
-"""Warm start of the coupled system, and the weight of the extrapolated correction; see `kernels.stepping.rod_warm_start`.
+"""Weight of the extrapolated correction in the coupled system; see `kernels.stepping.warm_start`.
 
 Among many contacts some of a correction is gone by the next step. The weight of a world is the mass-weighted cosine between its
 correction and the last extrapolated one. It is lower if the correction has grown by more than `GROWTH`. So a shock is not repeated,
@@ -9,11 +9,8 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import ITERATE_ACTION, LOAD_SCALE, STEP_PROGRESS
+from ddg_warp.kernels.core.islands import LOAD_SCALE
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, items_function, until_function
-from ddg_warp.kernels.newton.edge_rotation import loose_function
-from ddg_warp.kernels.newton.rod_iterate import ROTATE_EDGES
-from ddg_warp.kernels.stepping.rod_warm_start import extrapolation_step_function
 
 GROWTH, LEAST = 4.0, 0.05  # growth of the correction with full weight; smallest weight, from which it recovers
 AGREEING, ADDED, BEFORE, FORCE = range(4)  # rows of sums over nodes: m a.b, m a.a, m b.b, m |a|; see `weigh`
@@ -21,44 +18,14 @@ SUMS = 4
 
 
 @cache
-def warm_start_kernels(real, linear, serial: bool):
-    """Build the kernels of the warm start.
+def trust_kernels(real, serial: bool):
+    """Build the kernels of the weight.
 
-    `foresee`: add extrapolated accelerations to the predictor.
     `weigh`: sum products of the new correction and the last extrapolated one.
     `trust`: write the weight of the correction.
     """
     share, until = items_function(serial), until_function(serial)
-    squared_step, free_components = extrapolation_step_function(real), loose_function(3, real)
-    V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def foresee(
-        a: wp.array(dtype=V),
-        fixed: wp.array(dtype=wp.uint8),
-        flags: wp.array2d(dtype=int),
-        scalars: wp.array2d(dtype=real),
-        blocks: int,
-        q: wp.array(dtype=V),
-        predicted: wp.array(dtype=V),
-        direction: wp.array(dtype=H),
-    ):
-        """Store the predictor q of worlds that still have to move, and add extrapolated accelerations.
-
-        Worlds with edge rotations take them as a `direction`; see `ddg_warp.solve.newton.edge_rotation`.
-        """
-        w, start = share(wp.tid(), blocks)
-        if scalars[STEP_PROGRESS, w] >= real(1.0):
-            return
-        weight = squared_step(flags, scalars, w)
-        for k in range(start, until(start, blocks)):
-            i = k + w * blocks
-            start_q = q[i]
-            predicted[i] = start_q
-            more = free_components(int(fixed[k]), weight * a[i])
-            q[i] = start_q + more
-            if flags[ITERATE_ACTION, w] == wp.static(ROTATE_EDGES):
-                direction[i] = H(linear(more[0]), linear(more[1]), linear(more[2]))
+    V = wp.types.vector(3, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def weigh(
@@ -113,4 +80,4 @@ def warm_start_kernels(real, linear, serial: bool):
             weight = real(0.0)
         trust_out[w] = weight
 
-    return foresee, weigh, trust
+    return weigh, trust

@@ -7,7 +7,7 @@ Both schemes solve one implicit Euler step of length s (s = h, or h/2 for the im
 so that inertia and mass-proportional damping alpha are one quadratic, coefficient * m |x - target|^2 / 2. The midpoint rule then
 extrapolates, x_n+1 = 2 x - x_n and v_n+1 = 2 (x - x_n) / s - v_n.
 
-Newton's method starts from the predictor, x_n + s v_n with rotated edges, plus a warm start: see `kernels.stepping.rod_warm_start`.
+Newton's method starts from the predictor, x_n + s v_n with rotated edges, plus a warm start: see `kernels.stepping.warm_start`.
 
 An island whose solve fails first repeats it with a cold start from x_n, then halves the substep (`substep_fraction`), each on its own.
 `step_progress` is the completed fraction of the step; both are multiples of powers of two, and exact. With large rotations of
@@ -39,7 +39,7 @@ from ddg_warp.kernels.core.islands import (
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.core.nodes import NodeStorage
-from ddg_warp.kernels.stepping.rod_warm_start import extrapolation_rate_function
+from ddg_warp.kernels.stepping.warm_start import extrapolation_rate_function
 
 
 @cache

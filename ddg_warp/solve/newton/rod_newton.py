@@ -12,7 +12,7 @@ from ddg_warp.kernels.linear import geometric_stiffness, mixed_axial_force
 from ddg_warp.kernels.newton import rod_iterate
 from ddg_warp.kernels.newton import rod_sweep as sweep
 from ddg_warp.kernels.residual import rod_residual
-from ddg_warp.kernels.stepping import rod_step, rod_warm_start
+from ddg_warp.kernels.stepping import rod_step, warm_start
 from ddg_warp.timers import timer
 
 FIRST_EXACT_ITERATION = 2  # Gauss-Newton iterations of "progressive": far from a solution the exact matrix is no better
@@ -153,7 +153,7 @@ class RodNewton:
         )
         self._check = rod_residual.check_kernel(kind, self.real, self.linear)
         self._predict = rod_step.predict_kernel(kind, self.real, self.linear, midpoint)
-        self._further = None if midpoint else rod_warm_start.further_kernel(kind, self.real, self.linear)
+        self._further = None if midpoint else warm_start.further_kernel(kind, self.real, self.linear)
         self._sweep, self._threads = None, 32 if columns < MANY else 128
         if not kind.closed:
             self._sweep = sweep.sweep_kernel(kind, self.real, self.linear, self.exact_from, self.psd == "none", split)

@@ -9,7 +9,7 @@ from ddg_warp.compile.precision import largest_carried
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.rod_layout import rod_storage
-from ddg_warp.kernels.stepping import rod_step, rod_warm_start, time_step
+from ddg_warp.kernels.stepping import rod_step, time_step, warm_start
 from ddg_warp.solve.forces.control_loads import ControlledLoads, RodScale
 from ddg_warp.solve.forces.drag import RodGroupDrag
 from ddg_warp.solve.forces.loads import Loads
@@ -38,7 +38,7 @@ class RodStep(StepDriver):
         self.group = group
         kind, real = group.kind, model.types.real
         self._begin = time_step.begin_kernel(kind.nodes, real, self.midpoint)
-        self._foresee = rod_warm_start.warm_start_kernel(kind, real, self.newton.linear)
+        self._foresee = warm_start.warm_start_kernel(kind.nodes, real, self.newton.linear)
         predicted = ((array.shape, array.dtype, model.wp_device) for array in (self.newton.x, self.newton.theta))
         self._predicted, self._predicted_angle = (device_arrays.allocate(*layout) for layout in predicted)
         self._nodes = time_step.finish_kernel(kind.nodes, real, self.midpoint)

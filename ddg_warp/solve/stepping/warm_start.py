@@ -1,9 +1,10 @@
-"""Warm start of the coupled system: extrapolate the last correction of the predictor; see `kernels.stepping.coupled_warm_start`."""
+"""Warm start of the coupled system: extrapolate the last correction of the predictor; see `kernels.stepping.warm_start`."""
 
 import warp as wp
 
 from ddg_warp import device_arrays
 from ddg_warp.kernels.stepping import coupled_warm_start
+from ddg_warp.kernels.stepping.warm_start import warm_start_kernel
 from ddg_warp.solve.linear.sparse_system import Sums
 
 
@@ -17,9 +18,8 @@ class WarmStart:
     def __init__(self, newton):
         coupled, device, serial = newton.coupled, newton.coupled.device, device_arrays.serial(newton.coupled.device)
         self.newton = newton
-        self._foresee, self._weigh, self._trust = coupled_warm_start.warm_start_kernels(
-            coupled.real, newton.linear, serial
-        )
+        self._foresee = warm_start_kernel(coupled.nodes, coupled.real, newton.linear)
+        self._weigh, self._trust = coupled_warm_start.trust_kernels(coupled.real, serial)
         self.predicted = wp.zeros_like(newton.iterates.q)
         self.trust = wp.ones(coupled.worlds, dtype=coupled.real, device=device)
         self._sum = None
@@ -39,9 +39,14 @@ class WarmStart:
     def start(self, before) -> None:
         """Extrapolate from the predictor of a step from a state `before`, and keep the predictor."""
         newton, coupled = self.newton, self.newton.coupled
-        iterates, system, islands = newton.iterates, newton.system, newton.islands
-        inputs = [before.a, system.masks.spatial, *islands.arrays, coupled.blocks]
-        coupled.sweep(self._foresee, inputs, [iterates.q, self.predicted, system.direction])
+        iterates, system, islands, points = newton.iterates, newton.system, newton.islands, coupled.points
+        wp.launch(
+            self._foresee,
+            coupled.node_threads,
+            [points(before.a), None, coupled.common(system.masks.spatial), coupled.count, *islands.arrays],
+            [points(iterates.q), None, points(self.predicted), None, coupled.components(system.direction)],
+            device=coupled.device,
+        )
         if newton.turns:
             newton.turns.go_further(before, self.predicted, iterates, system, islands)
 

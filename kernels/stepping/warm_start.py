@@ -13,15 +13,17 @@ import warp as wp
 from ddg_warp.kernels.core.islands import (
     COLD_START,
     INVERSE_STEP,
+    ITERATE_ACTION,
     ITERATION,
     LOAD_SCALE,
     ROTATE_PREDICTOR,
     STEP_PROGRESS,
 )
-from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
+from ddg_warp.kernels.core.launch import CPU_OPTIONS
+from ddg_warp.kernels.core.nodes import NodeStorage
 from ddg_warp.kernels.elements.rod_layout import RodKind
 from ddg_warp.kernels.newton.edge_rotation import EXTRAPOLATE_ROTATED, loose_function
-from ddg_warp.kernels.newton.rod_iterate import search_functions
+from ddg_warp.kernels.newton.rod_iterate import ROTATE_EDGES, search_functions
 
 MAX_WARM_START_ITERATIONS = 6  # maximum iterations of a solve whose correction is extrapolated
 
@@ -63,20 +65,22 @@ def extrapolation_rate_function(real, midpoint: bool, crowd: bool = False):
 
 
 @cache
-def warm_start_kernel(kind: RodKind, real, linear):
+def warm_start_kernel(nodes: NodeStorage, real, linear):
     """Build the kernel of the warm start.
 
-    `foresee`: store the predictor of every rod that still has to move, and add extrapolated accelerations.
+    `foresee`: store the predictor of every island that still has to move, and add extrapolated accelerations.
 
-    For rods with rotated edges they are written as a `direction` for `further_kernel`.
+    Islands with rotated edges take them as a `direction`; see `further_kernel` and `ddg_warp.solve.newton.edge_rotation`.
     """
-    dim, twist = kind.dim, kind.twist
-    V = wp.types.vector(dim, real)
-    until, squared_step, loose = (
-        until_function(kind.serial),
-        extrapolation_step_function(real),
-        loose_function(dim, real),
-    )
+    dim, twist, coupled = nodes.dim, nodes.twist, nodes.coupled
+    V, (items, until) = wp.types.vector(dim, real), nodes.thread_functions
+    squared_step, loose = extrapolation_step_function(real), loose_function(dim, real)
+
+    @wp.func
+    def rotates(flags: wp.array2d(dtype=int), island: int):
+        if wp.static(coupled):
+            return flags[ITERATE_ACTION, island] == wp.static(ROTATE_EDGES)
+        return flags[ROTATE_PREDICTOR, island] != 0
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def foresee(
@@ -92,25 +96,26 @@ def warm_start_kernel(kind: RodKind, real, linear):
         predicted_angle: wp.array2d(dtype=real),
         direction: wp.array3d(dtype=linear),
     ):
-        start, r = wp.tid()
-        n = count[r]
-        if scalars[STEP_PROGRESS, r] >= real(1.0) or start >= n:
+        i, j = wp.tid()
+        island, first = items(i, j)
+        n = count[island]
+        if scalars[STEP_PROGRESS, island] >= real(1.0) or first >= n:
             return
-        weight = squared_step(flags, scalars, r)
-        for k in range(start, until(start, n)):
-            mask = int(fixed[k, r])
-            position = x[k, r]
-            predicted[k, r] = position
-            correction = loose(mask, weight * a0[k, r])
-            x[k, r] = position + correction
-            if flags[ROTATE_PREDICTOR, r] != 0:
+        weight = squared_step(flags, scalars, island)
+        for k in range(first, until(first, n)):
+            mask = int(fixed[k, island])
+            position = x[k, island]
+            predicted[k, island] = position
+            correction = loose(mask, weight * a0[k, island])
+            x[k, island] = position + correction
+            if rotates(flags, island):
                 for d in range(wp.static(dim)):
-                    direction[d, k, r] = linear(correction[d])
+                    direction[d, k, island] = linear(correction[d])
             if wp.static(twist):
-                angle = theta[k, r]
-                predicted_angle[k, r] = angle
+                angle = theta[k, island]
+                predicted_angle[k, island] = angle
                 if ((mask >> wp.static(dim)) & 1) == 0:
-                    theta[k, r] = angle + weight * alpha0[k, r]
+                    theta[k, island] = angle + weight * alpha0[k, island]
 
     return foresee
 
