@@ -246,7 +246,7 @@ def test_sums_over_ranges(device):
     for ranges in (1, 3):
         integrator, end = ddg.Integrator(model, "implicit_midpoint"), state
         drift = integrator._chains[0].energy
-        drift.ranges, drift.sums = ranges, wp.zeros((ranges, 4, 1), dtype=wp.float64, device=device)
+        drift.ranges, drift.sums = ranges, wp.zeros((2 * ranges, 4, 1), dtype=wp.float64, device=device)
         drift.rows = drift.sums.transpose((1, 0, 2))
         for _ in range(5):
             end = integrator.step(end, 0.3 / RATE)

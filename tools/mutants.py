@@ -165,7 +165,7 @@ FAULTS = (
     # time stepping and forces
     Fault(
         "energy drift: sign of the work of stresses",
-        "kernels/stepping/rod_energy_drift.py",
+        "kernels/stepping/energy_drift.py",
         "B(end - start - w * wp.dot(slope, strain)",
         "B(end - start + w * wp.dot(slope, strain)",
         ("tests/test_midpoint_energy.py",),

@@ -213,6 +213,10 @@ def coupled_storage(term: Term, real, slots: bool = True, serial: bool = False) 
         return place(inputs, inputs.q, world, e)
 
     @wp.func
+    def reach(inputs: Inputs, world: int, e: int):
+        return wp.max(wp.abs(inputs.q[inputs.slots[0, e] + world * inputs.blocks]))
+
+    @wp.func
     def displacement(inputs: Inputs, w: wp.array(dtype=V), world: int, e: int, all: bool):
         q, _s = place(inputs, w, world, e)
         return q
@@ -228,6 +232,7 @@ def coupled_storage(term: Term, real, slots: bool = True, serial: bool = False) 
         column=column,
         whole=whole,
         read=read,
+        reach=reach,
         displacement=displacement,
         Displacements=wp.array(dtype=V),
         slots=spread if slots else None,

@@ -3,7 +3,7 @@
 A kernel reads the local dofs of an element, evaluates strains and Jacobian, and writes columns. Storages differ in where dofs lie
 and which thread takes which element. An `ElementStorage` holds these as Warp functions that are chosen when a kernel is built.
 `kernels.elements.rod_layout.rod_storage` is that of uncoupled rods, `kernels.elements.coupled_element.coupled_storage` that of the
-coupled system. `kernels.adjoint.elements` and `kernels.stepping.rod_energy_drift` are written over the same storages.
+coupled system. `kernels.adjoint.elements` and `kernels.stepping.energy_drift` are written over the same storages.
 
 Alternative: one source for the solvers around elements. It is separate where the algorithms differ. Residuals have other stopping
 rules: sums over a whole rod, or over hierarchical clusters. The line search of rods is fused with their sweep, one thread a rod and
@@ -68,6 +68,7 @@ class ElementStorage:
         column: (inputs, island, e) -> column of element e.
         whole: (inputs, island, e) -> True if the element has all edges of its window.
         read: (inputs, island, e, whole) -> (window, lagged).
+        reach: (inputs, island, e) -> largest coordinate of the first node [m], whose rounding strains the element.
         displacement: (inputs, w, island, e, whole) -> window of a displacement w of all dofs.
         Displacements: type of the array of such a w.
         slots: (f, local node) -> derivative with respect to a dof block; None if derivatives stay by the window.
@@ -87,6 +88,7 @@ class ElementStorage:
     column: Callable
     whole: Callable
     read: Callable
+    reach: Callable
     displacement: Callable
     Displacements: Any
     slots: Callable | None = None

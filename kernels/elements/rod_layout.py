@@ -318,6 +318,10 @@ def rod_storage(kind: RodKind, real, linear=None) -> ElementStorage:
         return window(inputs.x, inputs.theta, k, n, all, r), lagged(inputs.frame, k, n, all, r)
 
     @wp.func
+    def reach(inputs: Inputs, r: int, k: int):
+        return wp.max(wp.abs(inputs.x[k, r]))
+
+    @wp.func
     def displacement(inputs: Inputs, w: wp.array3d(dtype=real), r: int, k: int, all: bool):
         return displaced(w, k, inputs.count[r], all, r)
 
@@ -337,6 +341,7 @@ def rod_storage(kind: RodKind, real, linear=None) -> ElementStorage:
         column=column,
         whole=whole,
         read=read,
+        reach=reach,
         displacement=displacement,
         Displacements=wp.array3d(dtype=real),
         stiffness_dofs=kind.dim,

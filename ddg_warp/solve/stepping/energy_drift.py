@@ -5,9 +5,11 @@ import math
 import numpy as np
 import warp as wp
 
-from ddg_warp import argument_checks
+from ddg_warp import argument_checks, device_arrays
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.stepping import coupled_energy_drift, rod_energy_drift
+from ddg_warp.kernels.elements.coupled_element import coupled_storage
+from ddg_warp.kernels.elements.rod_layout import rod_storage
+from ddg_warp.kernels.stepping import energy_drift
 from ddg_warp.solve.linear.sparse_system import Sums
 from ddg_warp.timers import timer
 
@@ -40,7 +42,7 @@ def summary(parts: list["_Energy"]) -> dict[str, float]:
 
 
 class _Energy:
-    """Discrete energy balance of the steps of a stepper; see `kernels.stepping.rod_energy_drift`.
+    """Discrete energy balance of the steps of a stepper; see `kernels.stepping.energy_drift`.
 
     Args:
         step: `RodStep` or `CoupledStep`.
@@ -58,23 +60,30 @@ class _Energy:
         def make(*shape):
             return wp.zeros(shape, dtype=real, device=self.device)
 
-        self.account = kept.account if kept else make(rod_energy_drift.ROWS, count)
+        self.account = kept.account if kept else make(energy_drift.ROWS, count)
         self.failed = kept.failed if kept else make(2, count)
-        self.sums = make(rows, rod_energy_drift.ROWS, count)
+        self.sums = make(rows, energy_drift.ROWS, count)
         self.rows = self.sums.transpose((1, 0, 2))
         self.floor = step.newton.options.floor_factor * self.model.types.eps
-        self._judge = rod_energy_drift.drift_kernel(real)
+        self._judge = energy_drift.drift_kernel(real)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [*self._elements, self._nodes, self._judge]
 
     def _enter(self) -> None:
         """Update the energy balance, or mark steps as failed."""
         step = self.step
-        wp.launch(
+        self._launch(
             self._judge,
             self.account.shape[1],
             [self.rows, step.integrator.energy_bound, *step.islands.arrays],
             [self.account, self.failed],
-            device=self.device,
         )
+
+    def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim, inputs, outputs, device=self.device)
 
     def failure(self, index: int) -> str:
         """Return the message on a failed rod or world."""
@@ -89,19 +98,16 @@ class RodEnergy(_Energy):
     """Energy balance of a rod group."""
 
     def __init__(self, step, kept=None):
-        group = step.group
+        group, newton = step.group, step.newton
         self.ranges = 1 if group.kind.serial else max(1, math.isqrt(group.nodes))
-        super().__init__(step, group.columns, self.ranges, kept)
-        self._loads = [step.newton.load, step.newton.load_angle]
+        super().__init__(step, group.columns, 2 * self.ranges, kept)
+        self._loads = [newton.load, newton.load_angle]
         self._follows = bool(group.host.followers)
         if self._follows:
             self._loads = [wp.clone(load) for load in self._loads]
-        self._measure = rod_energy_drift.rod_kernel(group.kind, self.model.types.real, step.newton.linear)
-
-    @property
-    def kernels(self) -> list:
-        """Kernels to load before a capture."""
-        return [self._measure, self._judge]
+        real = self.model.types.real
+        self._elements = [energy_drift.element_kernel(rod_storage(group.kind, real), real, newton.linear)]
+        self._nodes = energy_drift.node_kernel(group.kind.nodes, real, group.kind.drag)
 
     @timer("energy")
     def judge(self, before, start) -> None:
@@ -109,24 +115,13 @@ class RodEnergy(_Energy):
         step, group, newton = self.step, self.step.group, self.step.newton
         if self._follows:
             step.loads.apply(newton.x, *self._loads)
-        wp.launch(
-            self._measure,
-            (self.ranges, group.columns),
-            [group.element_inputs(state, start.last, step.islands.inverse_step) for state in (before, newton)]
-            + [before.v, before.omega, *step.islands.arrays, newton.mass, group.rotary]
-            + [
-                *self._loads,
-                newton.load,
-                newton.load_angle,
-                int(self._follows),
-                newton.stiffness,
-                step.damping,
-                self.floor,
-                self.ranges,
-            ],
-            [self.rows],
-            device=self.device,
-        )
+        grid, common, scalars = (self.ranges, group.columns), [self.floor, self.ranges], step.islands.arrays[1]
+        states = [group.element_inputs(state, start.last, step.islands.inverse_step) for state in (before, newton)]
+        read = [*states, device_arrays.columns(newton.stiffness), scalars, *common]
+        self._launch(self._elements[0], grid, read, [self.rows[:, : self.ranges]])
+        read = [before.x, before.v, before.theta, before.omega, newton.x, newton.theta, newton.mass, group.rotary]
+        read += [group.count, *self._loads, newton.load, newton.load_angle, int(self._follows)]
+        self._launch(self._nodes, grid, [*read, scalars, step.damping, *common], [self.rows[:, self.ranges :]])
         self._enter()
 
 
@@ -134,65 +129,43 @@ class CoupledEnergy(_Energy):
     """Energy balance of the coupled system."""
 
     def __init__(self, step, kept=None):
-        coupled, worlds = step.coupled, step.model.worlds
+        coupled, worlds, rows = step.coupled, step.model.worlds, energy_drift.ROWS
         super().__init__(step, worlds, len(coupled.sets) + 1, kept)
         real = self.model.types.real
         counts = [*(part.elements for part in coupled.sets), coupled.blocks]
-        self._values = [wp.zeros((rod_energy_drift.ROWS * worlds, n), dtype=real, device=self.device) for n in counts]
-        self._add = [Sums(rod_energy_drift.ROWS * worlds, n, real, self.device) for n in counts]
+        self._values = [wp.zeros((rows * worlds, n), dtype=real, device=self.device) for n in counts]
+        self._rows = [v.reshape((rows, worlds, -1)).transpose((0, 2, 1)) for v in self._values]
+        self._add = [Sums(rows * worlds, n, real, self.device) for n in counts]
         self._out = [self.sums[i].flatten() for i in range(len(counts))]
-        self._elements = [
-            coupled_energy_drift.element_kernel(part.term, real, step.newton.linear) for part in coupled.sets
-        ]
+        storages = [coupled_storage(part.term, real) for part in coupled.sets]
+        self._elements = [energy_drift.element_kernel(storage, real, step.newton.linear) for storage in storages]
         force = step.newton.loading.force
         self._load = wp.clone(force) if coupled.host.followers else force
-        self._blocks = coupled_energy_drift.block_kernel(real, step.drag is not None)
+        self._nodes = energy_drift.node_kernel(coupled.nodes, real, step.drag is not None)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        sums = [kernel for add in self._add for kernel in add.kernels]
-        return [*self._elements, self._blocks, self._judge, *sums]
+        return [*super().kernels, *(kernel for add in self._add for kernel in add.kernels)]
 
     @timer("energy")
     def judge(self, before, middle) -> None:
         """Test the energy drift of the step from `before`, with the lagged data of `middle`."""
         step, coupled, newton = self.step, self.step.coupled, self.step.newton
         q, loading, outputs = newton.iterates.q, newton.loading, newton.elements.outputs
+        points, scalars = coupled.points, step.islands.arrays[1]
         for i, (part, data, kernel) in enumerate(zip(coupled.sets, outputs, self._elements, strict=True)):
-            wp.launch(
-                kernel,
-                (step.model.worlds, part.elements),
-                [
-                    coupled.elements(middle, i, q=q, rate=step.islands.inverse_step),
-                    before.q,
-                    data["stiffness"],
-                    self.floor,
-                    *step.islands.arrays,
-                ],
-                [self._values[i]],
-                device=self.device,
-            )
-        if coupled.host.followers:
-            step.loads.apply(coupled.points(q), coupled.points(self._load), coupled.angles(self._load))
-        wp.launch(
-            self._blocks,
-            len(q),
-            [
-                before.q,
-                before.v,
-                q,
-                loading.mass,
-                *step.islands.arrays,
-                step.damping,
-                self._load,
-                loading.force,
-                self.floor,
-            ]
-            + [coupled.blocks],
-            [self._values[-1]],
-            device=self.device,
-        )
+            states = [coupled.elements(middle, i, blocks, step.islands.inverse_step) for blocks in (before.q, q)]
+            read = [*states, data["stiffness"], scalars, self.floor, part.elements]
+            self._launch(kernel, (coupled.worlds, part.elements), read, [self._rows[i]])
+        follows = bool(coupled.host.followers)
+        if follows:
+            step.loads.apply(points(q), points(self._load), coupled.angles(self._load))
+        read = [points(before.q), points(before.v), None, None, points(q), None]
+        read += [loading.mass.transpose((1, 0)), None, coupled.count]
+        read += [points(self._load), None, points(loading.force), None, int(follows)]
+        read += [scalars, step.damping, self.floor, coupled.blocks]
+        self._launch(self._nodes, (coupled.worlds, coupled.blocks), read, [self._rows[-1]])
         for add, values, out in zip(self._add, self._values, self._out, strict=True):
             add(values, out)
         self._enter()

@@ -69,7 +69,7 @@ class Integrator:
             supports and the rounding floor do not count. A step beyond the bound is retried at half length, and then fails with the
             outcome `energy_drift`. The count starts at a state from outside (a resumed run counts from zero). Resolved motion
             conserves the energy to about 1e-3, while an unstable run multiplies it within some steps: the default of a tenth lies
-            between. Implicit Euler dissipates and is not watched. See `kernels.stepping.rod_energy_drift`.
+            between. Implicit Euler dissipates and is not watched. See `kernels.stepping.energy_drift`.
         check_every: steps between readings of the outcomes; by default 1 on the CPU and 32 on CUDA.
         failures: "raise" raises an error for a failed step. With "flag" nothing is read or raised, and `outcomes` lists the outcomes.
             A world with a failed step keeps the state before the step until `reset`, or until the integrator gets a state from

@@ -8,6 +8,9 @@ with E the elastic energy and f the follower loads, which the rule evaluates at 
 forces' work along x1 - x0 is the change of kinetic energy, M (v1 - v0) . (v1 + v0) / 2, the work of loads and supports, or
 dissipation. The drift is zero where E is quadratic in x and no load follows. It accumulates, at worst without a bound, where steps
 rotate stiff elements far (Simo and Tarnow, Z. angew. Math. Phys. 43, 1992, 757).
+
+Elements and nodes of an island contribute rows, summed over fixed ranges. Range i has the items i, i + ranges, ..., so that
+neighbouring threads read neighbouring items. In the coupled system every item is a range, and `Sums` add the rows.
 """
 
 from functools import cache
@@ -17,8 +20,10 @@ import warp as wp
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.islands import INVERSE_STEP, STATUS, STEP_PROGRESS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
+from ddg_warp.kernels.core.nodes import NodeStorage
 from ddg_warp.kernels.elements.element_path import ElementStorage, parameter_function
-from ddg_warp.kernels.elements.rod_layout import RodKind, inertia_type, rod_storage
+from ddg_warp.kernels.elements.rod_layout import drag_structure
+from ddg_warp.kernels.forces.drag import block_inertia
 from ddg_warp.kernels.terms import Term
 
 DRIFT, ROUNDING, ENERGY, DISSIPATED = range(4)  # rows of a balance
@@ -102,84 +107,132 @@ def rows_function(storage: ElementStorage, index: int, real):
 
 
 @cache
-def rod_kernel(kind: RodKind, real, linear):
-    """Build the kernel of the rows of a step of every rod, summed over ranges.
+def element_kernel(storage: ElementStorage, real, linear):
+    """Build the kernel of the rows of elements.
 
-    Range i holds the nodes i, i + ranges, ...; see `kernels.newton.line_search_parallel`.
+    `measure`: sum rows of a step over the elements first, first + ranges, ... of an island.
+
+    A start state and a middle, the solution of the solve, come as inputs of elements.
     """
-    V, B, storage = wp.types.vector(kind.dim, real), wp.types.vector(ROWS, real), rod_storage(kind, real)
-    Inputs, read, column_of, whole_of = storage.Inputs, storage.read, storage.column, storage.whole
-    rows_of_all = rows_function(storage, len(kind.terms) - 1, real)
-    twist, closed, drag, Inertia = kind.twist, kind.closed, kind.drag, inertia_type(kind, real)
+    B, Inputs, items, count_of = wp.types.vector(ROWS, real), storage.Inputs, storage.items, storage.count
+    whole_of, read, column_of, reach_of = storage.whole, storage.read, storage.column, storage.reach
+    rows_of_all = rows_function(storage, len(storage.terms) - 1, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def measure(
         start: Inputs,
         middle: Inputs,
-        v0: wp.array2d(dtype=V),
-        omega0: wp.array2d(dtype=real),
-        flags: wp.array2d(dtype=int),
+        stiffness: wp.array(dtype=linear),
         scalars: wp.array2d(dtype=real),
+        floor: real,
+        ranges: int,
+        rows_out: wp.array3d(dtype=real),
+    ):
+        i, j = wp.tid()
+        island, first = items(i, j)
+        if scalars[STEP_PROGRESS, island] >= real(1.0):
+            return
+        total = B()
+        for e in range(first, count_of(middle, island), ranges):
+            column = column_of(middle, island, e)
+            whole = whole_of(middle, island, e)
+            q0, s0 = read(start, island, e, whole)
+            q, s = read(middle, island, e, whole)
+            reach = reach_of(middle, island, e)
+            total += rows_of_all(middle, q0, s0, q, s, whole, reach, floor, island, e, column)
+            least = floor * reach
+            total[wp.static(ROUNDING)] = total[wp.static(ROUNDING)] + real(stiffness[column]) * least * least
+        for row in range(wp.static(ROWS)):
+            rows_out[row, first, island] = total[row]
+
+    return measure
+
+
+@cache
+def node_kernel(nodes: NodeStorage, real, drag: bool):
+    """Build the kernel of the rows of nodes.
+
+    `measure`: sum work of follower loads, kinetic energy at the end, and dissipation by damping and drag, over the nodes first,
+    first + ranges, ... of an island.
+
+    Masses are a scalar a node of a rod, a vector a dof block.
+    """
+    twist, coupled = nodes.twist, nodes.coupled
+    V, B, (items, _) = wp.types.vector(nodes.dim, real), wp.types.vector(ROWS, real), nodes.thread_functions
+    M = V if coupled else real
+    Inertia = (block_inertia(real) if coupled else drag_structure(nodes.dim, real)) if drag else M
+
+    @wp.func
+    def mass_of(inertia: Inertia):
+        if wp.static(drag):
+            return inertia.mass
+        else:
+            return inertia
+
+    @wp.func
+    def square(m: M, v: V):
+        """Return m v . v."""
+        if wp.static(coupled):
+            return wp.dot(wp.cw_mul(m, v), v)
+        else:
+            return m * wp.length_sq(v)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def measure(
+        x0: wp.array2d(dtype=V),
+        v0: wp.array2d(dtype=V),
+        theta0: wp.array2d(dtype=real),
+        omega0: wp.array2d(dtype=real),
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
         mass: wp.array2d(dtype=Inertia),
         rotary: wp.array2d(dtype=real),
+        count: wp.array(dtype=int),
         load: wp.array2d(dtype=V),
         load_angle: wp.array2d(dtype=real),
-        load_there: wp.array2d(dtype=V),
-        load_angle_there: wp.array2d(dtype=real),
+        load_solved: wp.array2d(dtype=V),
+        load_angle_solved: wp.array2d(dtype=real),
         follows: int,
-        stiffness: wp.array2d(dtype=linear),
+        scalars: wp.array2d(dtype=real),
         damping: wp.array(dtype=real),
         floor: real,
         ranges: int,
         rows_out: wp.array3d(dtype=real),
     ):
-        """Sum the rows of a rod; `load` and `load_angle` belong to the iterate, `load_there` and `load_angle_there` to the solve."""
-        first, r = wp.tid()
-        if scalars[STEP_PROGRESS, r] >= real(1.0):
+        """Sum rows; `load` is the load at the iterate x, `load_solved` the load of the solve."""
+        i, j = wp.tid()
+        island, first = items(i, j)
+        if scalars[STEP_PROGRESS, island] >= real(1.0):
             return
-        n = middle.count[r]
+        rate = real(2.0) * scalars[INVERSE_STEP, island]
         total = B()
-        for k in range(first, n, ranges):
-            if wp.static(drag):
-                m = mass[k, r].mass
-            else:
-                m = mass[k, r]
-            x = middle.x[k, r]
-            moved = x - start.x[k, r]
-            v = moved * (real(2.0) * scalars[INVERSE_STEP, r]) - v0[k, r]
-            kinetic = real(0.5) * m * wp.length_sq(v)
-            damped = real(2.0) * damping[0] * scalars[INVERSE_STEP, r] * m * wp.length_sq(moved)
+        for k in range(first, count[island], ranges):
+            m = mass_of(mass[k, island])
+            moved = x[k, island] - x0[k, island]
+            kinetic = real(0.5) * square(m, moved * rate - v0[k, island])
+            damped = damping[0] * rate * square(m, moved)
+            rotated = real(0.0)
             if wp.static(twist):
-                turned = middle.theta[k, r] - start.theta[k, r]
-                spin = turned * (real(2.0) * scalars[INVERSE_STEP, r]) - omega0[k, r]
-                kinetic += real(0.5) * rotary[k, r] * spin * spin
-                damped += real(2.0) * damping[0] * scalars[INVERSE_STEP, r] * rotary[k, r] * turned * turned
-                if wp.static(drag):
-                    damped += real(2.0) * mass[k, r].spin * turned * turned
+                rotated = theta[k, island] - theta0[k, island]
+                spin = rotated * rate - omega0[k, island]
+                kinetic += real(0.5) * rotary[k, island] * spin * spin
+                damped += damping[0] * rate * rotary[k, island] * rotated * rotated
             if wp.static(drag):
-                away = x - mass[k, r].carried
-                damped += real(2.0) * wp.dot(away, mass[k, r].resistance * away)
+                away = x[k, island] - mass[k, island].carried
+                damped += real(2.0) * wp.dot(away, mass[k, island].resistance * away)
+                if wp.static(twist):
+                    damped += real(2.0) * mass[k, island].spin * rotated * rotated
             made = real(0.0)
             worked = real(0.0)
             if follows != 0:
-                made = wp.dot(load_there[k, r] - load[k, r], moved)
-                worked = wp.abs(wp.dot(load[k, r], moved))
+                made = wp.dot(load_solved[k, island] - load[k, island], moved)
+                worked = wp.abs(wp.dot(load[k, island], moved))
                 if wp.static(twist):
-                    turned = middle.theta[k, r] - start.theta[k, r]
-                    made += (load_angle_there[k, r] - load_angle[k, r]) * turned
-                    worked += wp.abs(load_angle[k, r] * turned)
+                    made += (load_angle_solved[k, island] - load_angle[k, island]) * rotated
+                    worked += wp.abs(load_angle[k, island] * rotated)
             total += B(real(2.0) * made, real(2.0) * floor * worked, kinetic, damped)
-            if wp.static(closed) or k < n - 1:
-                whole = whole_of(middle, r, k)
-                reach = wp.max(wp.abs(x))
-                q0, s0 = read(start, r, k, whole)
-                q, s = read(middle, r, k, whole)
-                column = column_of(middle, r, k)
-                total += rows_of_all(middle, q0, s0, q, s, whole, reach, floor, r, k, column)
-                least = floor * reach
-                total[wp.static(ROUNDING)] = total[wp.static(ROUNDING)] + real(stiffness[k, r]) * least * least
-        for i in range(wp.static(ROWS)):
-            rows_out[i, first, r] = total[i]
+        for row in range(wp.static(ROWS)):
+            rows_out[row, first, island] = total[row]
 
     return measure
 
