@@ -216,7 +216,7 @@ FAULTS = (
     # adjoint
     Fault(
         "adjoint of a step: velocity at the end dropped",
-        "kernels/adjoint/rod_step.py",
+        "kernels/adjoint/time_step.py",
         "by_v = w_free * (rho * m) - ended * before_kept",
         "by_v = w_free * (rho * m)",
         ("tests/learn/test_adjoint.py",),

@@ -13,9 +13,8 @@ from ddg_warp.adjoint.coupled_predictor import CoupledPredictor
 from ddg_warp.adjoint.drag import CoupledDragAdjoint
 from ddg_warp.adjoint.follower_loads import Followers
 from ddg_warp.adjoint.supports import Supports
-from ddg_warp.kernels.adjoint import coupled_step, elements
+from ddg_warp.kernels.adjoint import coupled_step, elements, time_step
 from ddg_warp.kernels.elements.coupled_element import FRAME, coupled_storage
-from ddg_warp.kernels.forces.drag import block_inertia
 from ddg_warp.model.coupled_model import CoupledState
 
 
@@ -108,8 +107,10 @@ class CoupledStepAdjoint:
             elements.strain_kernel(storage, 0, real, True) if part.term.density.lagged else None
             for storage, part in zip(storages, coupled.sets, strict=True)
         ]
-        self._solution, self._inert, self._start, self._ended = coupled_step.step_kernels(real, midpoint, drag)
-        self._inertia = self.drag.inertia if drag else wp.zeros((1, 1), dtype=block_inertia(real), device=self.device)
+        self._solution, self._inertia, self._start = time_step.step_kernels(coupled.nodes, real, midpoint, drag)
+        self._ended = coupled_step.end_kernel(real)
+        self._resisted = self.drag.inertia.transpose((1, 0)) if drag else None
+        self._leaves = coupled.common(wp.zeros(coupled.blocks, dtype=wp.uint8, device=self.device))
         self._rates, self._rubbing = (wp.zeros(coupled.worlds, dtype=real, device=self.device) for _ in range(2))
 
         def make(dtype=coupled.vector):
@@ -148,7 +149,7 @@ class CoupledStepAdjoint:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         result = [*self._vjp, *(kernel for kernel in self._strains if kernel)]
-        result += [self._solution, self._inert, self._start, self._ended]
+        result += [self._solution, self._inertia, self._start, self._ended]
         parts = (self._shares, self.solve, self.supports, self.drag, self.followers, self.predictor, self.contact)
         return result + [kernel for part in parts if part for kernel in part.kernels]
 
@@ -228,9 +229,12 @@ class CoupledStepAdjoint:
         # the solve
         if self.drag:
             self.drag.resist(before, tangents, rate)
-        read = [cotangent.q, cotangent.v, by_end, self._inertia, rate, last, coupled.blocks]
-        self._launch(self._solution, len(grad_q), read, [grad_q])
+        points, components, grid = coupled.points, coupled.components, (coupled.worlds, coupled.blocks)
         self._rates.fill_(rate)
+        end, out, began, more = *map(coupled.node_state, (cotangent, start, before)), components(by_end)
+        masses = [coupled.mass.transpose((1, 0)), None]
+        read = [end, more, None, *masses, self._resisted, coupled.count, last, self._rates]
+        self._launch(self._solution, grid, read, [components(grad_q), None])
         self._rubbing.fill_(kept.rubbing or rate)
         rough, lag_pairs = None, reversed(list(pairwise([before.q, *kept.lagged, solved.q])))
         if kept.rubbing:  # normal forces of the equilibrium
@@ -251,20 +255,10 @@ class CoupledStepAdjoint:
             shares.add_own(own_rows)
             if self.drag:
                 self.drag.vjp(before, tangents, q, w, rate, grad_q, start, inputs.rate, by_tangents)
-            read = [
-                q,
-                before.q,
-                before.v,
-                w,
-                coupled.mass,
-                self.gravity,
-                coupled.host.nodes,
-                last,
-                coupled.blocks,
-                rate,
-            ]
-            written = [start.q, start.v, inputs.load, inputs.mass, inputs.rate, inputs.damping, inputs.gravity]
-            self._launch(self._inert, len(q), [*read, self._damping], written)
+            read = [points(q), None, began, components(w), *masses, coupled.count, coupled.host.nodes, last]
+            read += [self._rates, self._damping, self.gravity, coupled.world]
+            written = [out, points(inputs.mass), None, points(inputs.rate), points(inputs.damping)]
+            self._launch(self._inertia, grid, read, [*written, points(inputs.gravity), components(inputs.load)])
             if self.contact:
                 by_lagged = next(
                     gradient
@@ -295,23 +289,9 @@ class CoupledStepAdjoint:
         start.frame, start.lag = carried, own_rows
         if s < np.inf:
             self.solve.stays(grad_q, self._stays)
-        self._launch(
-            self._start,
-            len(grad_q),
-            [
-                cotangent.q,
-                cotangent.v,
-                by_end,
-                solved.q,
-                before.q,
-                self._stays,
-                self._inertia,
-                last,
-                coupled.blocks,
-                rate,
-            ],
-            [start.q, start.v, inputs.rate],
-        )
+        read = [end, more, points(solved.q), None, began, components(self._stays), self._leaves, *masses]
+        read += [self._resisted, coupled.count, last, self._rates]
+        self._launch(self._start, grid, read, [out, points(inputs.rate)])
         return start, inputs
 
     def has_overflow(self, q: wp.array) -> bool:

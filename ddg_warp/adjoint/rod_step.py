@@ -13,7 +13,7 @@ from ddg_warp.adjoint.rod_predictor import RodPredictor
 from ddg_warp.adjoint.supports import Supports
 from ddg_warp.compile.dof_map import FREE
 from ddg_warp.kernels.adjoint import elements, rod_elements
-from ddg_warp.kernels.adjoint import rod_step as step
+from ddg_warp.kernels.adjoint import time_step as step
 from ddg_warp.kernels.elements.rod_layout import rod_storage
 from ddg_warp.model.state import RodGroupState
 
@@ -102,9 +102,9 @@ class RodStepAdjoint:
         self._frame = rod_elements.frame_kernel(kind, real, first=not kind.viscous) if kind.twist else None
         self._ends, self._nodes, self._edges = rod_elements.gather_kernels(kind, real)
         self.unread = {"v", "omega", "a", "alpha"} | (set() if kind.viscous else {"frame", "last"})
-        self._more_to_start = bool(self.drag or self.predictor)
-        self._solution, self._start = step.step_kernels(kind, real, midpoint, self._more_to_start)
-        self._moved = device_arrays.upload(np.tile(_moved(group), (1, group.worlds)), wp.uint8, device)
+        self._solution, self._inertia, self._start = step.step_kernels(kind.nodes, real, midpoint, kind.drag)
+        leaves = np.tile(~group.host.fixed | _moved(group), (1, group.worlds))
+        self._leaves = device_arrays.upload(leaves, wp.uint8, device)
         self._rate = wp.zeros(group.columns, dtype=real, device=device)
         self._damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
         self.gravity = wp.array(np.tile(group.gravity_host, (group.worlds, 1)), dtype=self.vector, device=device)
@@ -181,8 +181,6 @@ class RodStepAdjoint:
         """
         group, kind, before = self.group, self.group.kind, kept.before
         start, inputs, window, lag = self._start_state, self._inputs, self._window, self._lag
-        for array in (inputs.rate, *((start.x, start.v, start.theta) if self._more_to_start else ())):
-            device_arrays.clear(array)
         self._rate.fill_(1.0 / s)
         by_frame, lagged = (
             cotangent.frame,
@@ -207,14 +205,18 @@ class RodStepAdjoint:
             self._launch(self._frame, [after.x, kept.frame, group.count, by_frame], [window, lagged])
         if kind.twist or kind.viscous:
             self._launch(self._ends, [window, group.count], [self._end])
-        motion, inertia = step.motion_type(kind.dim, self.real), step.inertia_type(kind.dim, self.real)
-        end = [_filled(motion, cotangent), self._end]
-        read = [*end, group.fixed, group.mass, group.rotary, group.count, self._rate]
+        end, out, began = map(group.node_state, (cotangent, start, before))
+        masses = [group.mass, group.rotary]
+        read = [end, self._end, group.fixed, *masses, None, group.count, group.nodes, self._rate]
         self._launch(self._solution, read, [self._dof, self._right])
         resisted = self.drag and (self.drag, before, tangents)
+        self.solve(kept, before.last, s, self._right, inputs.load, resisted)
+        read = [kept.x, kept.theta, began, inputs.load, *masses, group.count, group.nodes, group.nodes]
+        read += [self._rate, self._damping, self.gravity, group.world]
+        written = [out, inputs.mass, inputs.rotary, inputs.rate, inputs.damping, inputs.gravity, None]
+        self._launch(self._inertia, read, written)
         read = [group.element_inputs(kept, before.last, self._rate), inputs.load]
         written = [*map(device_arrays.columns, (window, lag, inputs.parameters, start.last, inputs.rate))]
-        self.solve(kept, before.last, s, self._right, inputs.load, resisted)
         for kernel in self._vjp:
             self._launch(kernel, read, written)
         self._launch(self._nodes, [window, group.count], [self._dof])
@@ -235,15 +237,15 @@ class RodStepAdjoint:
             self.followers.vjp(predictor.x, *w, predictor.by_x[: kind.dim])
         if predictor:
             predictor.vjp(before, self._nodes, window, self._dof, start, inputs.rate)
-        read = [*end, kept.x, kept.theta, _filled(motion, before), inputs.load, self._dof, group.mass, group.rotary]
-        read += [group.fixed, self._moved, group.count, self._rate, self._damping, self.gravity, group.world]
-        self._launch(self._start, read, [_filled(motion, start), _filled(inertia, inputs)])
+        read = [end, self._end, kept.x, kept.theta, began, self._dof, self._leaves, *masses, None, group.count]
+        self._launch(self._start, [*read, group.nodes, self._rate], [out, inputs.rate])
         return start, inputs
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        result = [*self._vjp, *self._strain, self._ends, self._nodes, self._edges, self._solution, self._start]
+        result = [*self._vjp, *self._strain, self._ends, self._nodes, self._edges]
+        result += [self._solution, self._inertia, self._start]
         result += [*([self._frame] if self._frame else []), *self.solve.kernels]
         parts = (self.supports, self.drag, self.followers, self.predictor)
         return result + [kernel for part in parts if part for kernel in part.kernels]
@@ -271,11 +273,3 @@ def _moved(group) -> np.ndarray:
     for place in host.turning[:, 0] - host.nodes:
         moved[place // rods, place % rods] |= 1 << group.kind.dim
     return moved
-
-
-def _filled(struct_type, values):
-    """Return a struct with the arrays of `values` by name."""
-    struct = struct_type()
-    for name in struct_type.vars:
-        setattr(struct, name, getattr(values, name))
-    return struct

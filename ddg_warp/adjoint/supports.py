@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.adjoint.rod_step import angle_kernel
+from ddg_warp.kernels.adjoint.time_step import angle_kernel
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.solve.forces.prescribed_element_data import CoupledMotion
 from ddg_warp.solve.forces.prescribed_motion import Motion

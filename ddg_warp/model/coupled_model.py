@@ -8,7 +8,7 @@ import warp as wp
 from ddg_warp import device_arrays as arrays
 from ddg_warp.compile.coupled.system import CoupledSystem, inert_mass
 from ddg_warp.compile.precision import float32_error, stiffnesses
-from ddg_warp.kernels.core.nodes import NodeStorage
+from ddg_warp.kernels.core.nodes import NodeStorage, state_type
 from ddg_warp.kernels.elements import coupled_element as elements
 from ddg_warp.kernels.elements import coupled_frames as frames
 from ddg_warp.kernels.elements import element_path
@@ -194,9 +194,15 @@ class CoupledModel:
         return np.tile(self.host.mass.ravel(), self.worlds)
 
     def points(self, blocks: wp.array) -> wp.array:
-        """View dof blocks (W N,) as [block][world]."""
-        size = 3 * wp.types.type_size_in_bytes(self.real)
-        return _view(blocks, self.vector, (self.blocks, self.worlds), (size, size * self.blocks))
+        """View values of dof blocks (W N,) as [block][world]."""
+        size = wp.types.type_size_in_bytes(blocks.dtype)
+        return _view(blocks, blocks.dtype, (self.blocks, self.worlds), (size, size * self.blocks))
+
+    def node_state(self, state: CoupledState):
+        """Return dof blocks of a state, and their rates, for kernels over nodes."""
+        result = state_type(self.nodes, self.real)()
+        result.x, result.v = self.points(state.q), self.points(state.v)
+        return result
 
     def common(self, values: wp.array) -> wp.array:
         """View values of dof blocks (N,), the same in all worlds, as [block][world]."""

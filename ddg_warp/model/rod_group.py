@@ -8,6 +8,7 @@ import warp as wp
 from ddg_warp import device_arrays
 from ddg_warp.compile import precision
 from ddg_warp.compile.rod_groups import RodGroupData
+from ddg_warp.kernels.core.nodes import state_type
 from ddg_warp.kernels.elements import rod_layout
 from ddg_warp.model.parameters import ParameterTable
 from ddg_warp.scene import drag
@@ -73,6 +74,12 @@ class RodGroup:
         inputs.last, inputs.rate = device_arrays.columns(last), self.still if rate is None else rate
         (inputs.buffer, inputs.table), inputs.count = (table or self.parameters).arrays, self.count
         return inputs
+
+    def node_state(self, state):
+        """Return positions and twist angles of a state, and their rates, for kernels over nodes."""
+        result = state_type(self.kind.nodes, self.parameters.arrays[0].dtype)()
+        result.x, result.v, result.theta, result.omega = state.x, state.v, state.theta, state.omega
+        return result
 
     def set_parameter(self, name: str, values: np.ndarray) -> bool:
         """Replace "term.parameter"; return True if its memory was reallocated.

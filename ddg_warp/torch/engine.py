@@ -16,7 +16,7 @@ from ddg_warp.adjoint.implicit import Adjoint, EquilibriumAdjoint
 from ddg_warp.adjoint.rod_predictor import RodPredictor
 from ddg_warp.adjoint.rod_step import SavedStep
 from ddg_warp.capture_lock import alone
-from ddg_warp.kernels.adjoint.rod_step import flag_kernels, requested_kernel, smooth_kernel
+from ddg_warp.kernels.adjoint.time_step import flag_kernels, requested_kernel, smooth_kernel
 from ddg_warp.model.controls import Controls
 from ddg_warp.model.rebuild import ModelBuilder
 from ddg_warp.model.state import Sliding

@@ -1,4 +1,4 @@
-"""Vector-Jacobian product of a rod step around the solve: end update, inertia and predictor; see `kernels.stepping.rod_step`.
+"""Vector-Jacobian product of a step around the solve: end update, inertia, prescribed angles; see `kernels.stepping.time_step`.
 
 Both solve m (c (x - x_n) - r v_n) + ... = 0 with r = 1 / s and c = r (r + alpha). Implicit Euler ends at x, with r (x - x_n); the
 midpoint rule at 2 x - x_n, with 2 r (x - x_n) - v_n.
@@ -9,194 +9,179 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.core import outcome
-from ddg_warp.kernels.core.dof_map import column_of, point_functions
+from ddg_warp.kernels.core.dof_map import column_of, point_functions, row_functions
 from ddg_warp.kernels.core.islands import RETRIES, STATUS, SUBSTEP_FRACTION
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.elements.rod_layout import RodKind
+from ddg_warp.kernels.core.nodes import NodeStorage, dof_functions, mass_functions, state_type
 from ddg_warp.kernels.elements.variation import angle_function
+from ddg_warp.kernels.forces.drag import block_inertia
 from ddg_warp.kernels.forces.prescribed_motion import functions, reached_function
+from ddg_warp.kernels.newton.edge_rotation import loose_function
 
 
 @cache
-def motion_type(dim: int, real):
-    """Return the struct of positions, angles and their rates of rods, or of gradients by them."""
-    V = wp.types.vector(dim, real)
-
-    @wp.struct
-    class Motion:
-        x: wp.array2d(dtype=V)
-        v: wp.array2d(dtype=V)
-        theta: wp.array2d(dtype=real)
-        omega: wp.array2d(dtype=real)
-
-    return Motion
-
-
-@cache
-def inertia_type(dim: int, real):
-    """Return the struct of gradients by masses, and by rate, damping and gravity per node."""
-    V = wp.types.vector(dim, real)
-
-    @wp.struct
-    class Inertia:
-        mass: wp.array2d(dtype=real)
-        rotary: wp.array2d(dtype=real)
-        rate: wp.array2d(dtype=real)
-        damping: wp.array2d(dtype=real)
-        gravity: wp.array2d(dtype=V)
-
-    return Inertia
-
-
-@cache
-def step_kernels(kind: RodKind, real, midpoint: bool, more_to_start: bool):
-    """Build the kernels of the end update and of inertia.
+def step_kernels(nodes: NodeStorage, real, midpoint: bool, drag: bool):
+    """Build the kernels of the end update and of inertia, for the nodes of all islands.
 
     `solution`: write gradients by the dofs of the solve, given gradients by the end of the step.
-    `start`: write gradients by the start of the step, masses, rate, damping and gravity, given these and the adjoint w.
+    `inertia`: write gradients by the start of the step, masses, rate, damping and gravity, given the adjoint w of the solve. In the
+    coupled system, which may solve again for each friction lag, add them, and w to gradients by loads.
+    `start`: add gradients by the start of the step and by the rate, through the end update and fixed dofs.
 
-    `more`: gradients by the dofs of the end through its frames and strains. `more_to_start`: True to add to gradients by the start that
-    other kernels have written.
+    `more`: gradients by the dofs of the end through its frames and strains. `resisted`: inertia and drag of the coupled system. The
+    first `positions` nodes have weight, and the first `inert` nodes have inertia: joint rotations begin every step at zero.
     """
-    dim, twist = kind.dim, kind.twist
-    settles = kind.drag and midpoint  # velocities of massless dofs are means over the step; see `drag.rod_kernels`
-    V, Motion, Inertia = wp.types.vector(dim, real), motion_type(dim, real), inertia_type(dim, real)
+    coupled, dim, block, mass_type = nodes.coupled, nodes.dim, nodes.block, nodes.mass_type(real)
+    settles = drag and midpoint  # then velocities of massless dofs are means over the step: `settle` of `forces.drag`
+    V, B, State = wp.types.vector(dim, real), wp.types.vector(block, real), state_type(nodes, real)
+    items, _ = nodes.thread_functions
+    (dofs, store), (masses, store_masses) = dof_functions(nodes, real), mass_functions(nodes, real)
+    (row_of, store_row), free_components = row_functions(block, real), loose_function(block, real)
     end_weight = real(2.0 if midpoint else 1.0)  # derivative of the end by the solution
     start_weight = real(1.0 if midpoint else 0.0)  # derivative of the end by minus the start
+    Inertia = block_inertia(real)
+
+    @wp.func
+    def rate_weight(m: B, resisted: wp.array2d(dtype=Inertia), k: int, island: int):
+        """Return the derivative of the velocities at the end by the mean velocities of the solve."""
+        result = B()
+        for d in range(wp.static(block)):
+            result[d] = end_weight
+            if wp.static(settles):
+                settled = m[d] <= real(0.0)
+                if wp.static(coupled):
+                    settled = settled and resisted[k, island].resistance[d, d] > real(0.0)
+                if settled:
+                    result[d] = real(1.0)
+        return result
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def solution(
-        by_end: Motion,
+        end: State,
         more: wp.array3d(dtype=real),
         fixed: wp.array2d(dtype=wp.uint8),
-        mass: wp.array2d(dtype=real),
+        mass: wp.array2d(dtype=mass_type),
         rotary: wp.array2d(dtype=real),
+        resisted: wp.array2d(dtype=Inertia),
         count: wp.array(dtype=int),
+        inert: int,
         rate: wp.array(dtype=real),
         dof_out: wp.array3d(dtype=real),
         right_out: wp.array3d(dtype=real),
     ):
-        """Write gradients by dofs, and the right-hand side of the adjoint solve, which is zero at fixed dofs."""
-        k, r = wp.tid()
-        if k >= count[r]:
+        """Write gradients by dofs; of rods, too, the right-hand side of the adjoint solve, which is zero at fixed dofs."""
+        i, j = wp.tid()
+        island, k = items(i, j)
+        if k >= count[island]:
             return
-        mask = int(fixed[k, r])
-        swing = end_weight
-        if wp.static(settles):
-            swing = wp.where(mass[k, r] <= real(0.0), real(1.0), end_weight)
-        total = by_end.x[k, r] * end_weight + by_end.v[k, r] * (rate[r] * swing)
-        for d in range(wp.static(dim)):
-            gradient = total[d] + end_weight * more[d, k, r]
-            dof_out[d, k, r] = gradient
-            right_out[d, k, r] = wp.where(((mask >> d) & 1) == 0, gradient, real(0.0))
-        if wp.static(twist):
-            swing = end_weight
-            if wp.static(settles):
-                swing = wp.where(rotary[k, r] <= real(0.0), real(1.0), end_weight)
-            by_angle = (
-                end_weight * (by_end.theta[k, r] + more[wp.static(dim), k, r]) + swing * by_end.omega[k, r] * rate[r]
+        total = row_of(more, k, island) * end_weight
+        if k < inert:
+            v = wp.cw_mul(
+                rate_weight(masses(mass, rotary, k, island), resisted, k, island), dofs(end.v, end.omega, k, island)
             )
-            dof_out[wp.static(dim), k, r] = by_angle
-            right_out[wp.static(dim), k, r] = wp.where(((mask >> wp.static(dim)) & 1) == 0, by_angle, real(0.0))
+            total += dofs(end.x, end.theta, k, island) * end_weight + v * rate[island]
+        store_row(dof_out, k, island, total)
+        if wp.static(not coupled):
+            store_row(right_out, k, island, free_components(int(fixed[k, island]), total))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def start(
-        by_end: Motion,
-        more: wp.array3d(dtype=real),
-        # the solution, the start, the adjoint w, and cotangents at fixed dofs
-        q: wp.array2d(dtype=V),
-        angle: wp.array2d(dtype=real),
-        before: Motion,
+    def inertia(
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        before: State,
         w: wp.array3d(dtype=real),
-        cotangent_fixed: wp.array3d(dtype=real),
-        mass: wp.array2d(dtype=real),
+        mass: wp.array2d(dtype=mass_type),
         rotary: wp.array2d(dtype=real),
-        fixed: wp.array2d(dtype=wp.uint8),
-        moved: wp.array2d(dtype=wp.uint8),
         count: wp.array(dtype=int),
+        positions: int,
+        inert: int,
         rate: wp.array(dtype=real),
         damping: wp.array(dtype=real),
         gravity: wp.array(dtype=V),
         world: wp.array(dtype=int),
-        by_start: Motion,
-        by_inertia: Inertia,
+        out: State,
+        mass_out: wp.array2d(dtype=mass_type),
+        rotary_out: wp.array2d(dtype=real),
+        rate_out: wp.array2d(dtype=real),
+        damping_out: wp.array2d(dtype=real),
+        gravity_out: wp.array2d(dtype=V),
+        load_out: wp.array3d(dtype=real),
     ):
-        """Write gradients by the start and by masses; add to gradients by the rate.
-
-        `moved`: mask of dofs with prescribed motion; other fixed dofs stay at the start. `world`: world of a column.
-        """
-        k, r = wp.tid()
-        if k >= count[r]:
+        """Write or add gradients of the residual; x and theta are the solution, `gravity` is by world."""
+        i, j = wp.tid()
+        island, k = items(i, j)
+        if k >= count[island]:
             return
-        rho = rate[r]
-        alpha = damping[0]
-        c = rho * (rho + alpha)
-        mask = int(fixed[k, r])
-        prescribed = int(moved[k, r])
-        m = mass[k, r]
-        w_free = V()
-        fixed_at_start = V()
-        by_x_end = by_end.x[k, r]
-        for d in range(wp.static(dim)):
-            by_x_end[d] = by_x_end[d] + more[d, k, r]
-            if ((mask >> d) & 1) == 0:
-                w_free[d] = w[d, k, r]
-            elif ((prescribed >> d) & 1) == 0:
-                fixed_at_start[d] = cotangent_fixed[d, k, r]
-        step = q[k, r] - before.x[k, r]
-        v0 = before.v[k, r]
-        ended = by_end.v[k, r]
-        velocity_weight = end_weight
-        before_kept = start_weight
-        if wp.static(settles):
-            if m <= real(0.0):
-                velocity_weight = real(1.0)
-                before_kept = real(0.0)
-        by_x = w_free * (c * m) + fixed_at_start - by_x_end * start_weight - ended * (rho * velocity_weight)
-        by_v = w_free * (rho * m) - ended * before_kept
-        if wp.static(more_to_start):
-            by_x += by_start.x[k, r]
-            by_v += by_start.v[k, r]
-        by_start.x[k, r] = by_x
-        by_start.v[k, r] = by_v
-        by_inertia.mass[k, r] = wp.dot(w_free, gravity[world[r]] - step * c + v0 * rho)
-        by_inertia.gravity[k, r] = w_free * m
-        grad_inverse_step = velocity_weight * wp.dot(ended, step) - m * wp.dot(
-            w_free, step * (real(2.0) * rho + alpha) - v0
-        )
-        by_damping = -m * rho * wp.dot(w_free, step)
-        if wp.static(twist):
-            free = real(0.0)
-            angle_at_start = real(0.0)
-            if ((mask >> wp.static(dim)) & 1) == 0:
-                free = w[wp.static(dim), k, r]
-            elif ((prescribed >> wp.static(dim)) & 1) == 0:
-                angle_at_start = cotangent_fixed[wp.static(dim), k, r]
-            j = rotary[k, r]
-            rotation = angle[k, r] - before.theta[k, r]
-            spin = before.omega[k, r]
-            spun = by_end.omega[k, r]
-            velocity_weight = end_weight
-            before_kept = start_weight
-            if wp.static(settles):
-                if j <= real(0.0):
-                    velocity_weight = real(1.0)
-                    before_kept = real(0.0)
-            by_end_angle = by_end.theta[k, r] + more[wp.static(dim), k, r]
-            by_angle = free * c * j + angle_at_start - by_end_angle * start_weight - spun * (rho * velocity_weight)
-            if wp.static(more_to_start):
-                by_angle += by_start.theta[k, r]
-            by_start.theta[k, r] = by_angle
-            by_start.omega[k, r] = free * rho * j - spun * before_kept
-            by_inertia.rotary[k, r] = free * (spin * rho - rotation * c)
-            grad_inverse_step += velocity_weight * spun * rotation - j * free * (
-                rotation * (real(2.0) * rho + alpha) - spin
-            )
-            by_damping -= j * rho * free * rotation
-        by_inertia.rate[k, r] = by_inertia.rate[k, r] + grad_inverse_step
-        by_inertia.damping[k, r] = by_damping
+        residual = row_of(w, k, island)
+        if wp.static(coupled):
+            store_row(load_out, k, island, row_of(load_out, k, island) + residual)
+        if k >= inert:
+            return
+        rho = rate[island]
+        c = rho * (rho + damping[0])
+        weighted = wp.cw_mul(masses(mass, rotary, k, island), residual)
+        step = dofs(x, theta, k, island) - dofs(before.x, before.theta, k, island)
+        velocity = dofs(before.v, before.omega, k, island)
+        force = velocity * rho - step * c
+        by_gravity = V()
+        if k < positions:
+            for d in range(wp.static(dim)):
+                force[d] = force[d] + gravity[world[island]][d]
+                by_gravity[d] = weighted[d]
+        by_x = weighted * c
+        by_v = weighted * rho
+        by_mass = wp.cw_mul(residual, force)
+        grad_inverse_step = -wp.dot(weighted, step * (real(2.0) * rho + damping[0]) - velocity)
+        by_damping = -rho * wp.dot(weighted, step)
+        if wp.static(coupled):
+            by_x += dofs(out.x, out.theta, k, island)
+            by_v += dofs(out.v, out.omega, k, island)
+            by_mass += masses(mass_out, rotary_out, k, island)
+            by_gravity += gravity_out[k, island]
+            grad_inverse_step += rate_out[k, island]
+            by_damping += damping_out[k, island]
+        store(out.x, out.theta, k, island, by_x)
+        store(out.v, out.omega, k, island, by_v)
+        store_masses(mass_out, rotary_out, k, island, by_mass)
+        gravity_out[k, island] = by_gravity
+        rate_out[k, island] = grad_inverse_step
+        damping_out[k, island] = by_damping
 
-    return solution, start
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def start(
+        end: State,
+        more: wp.array3d(dtype=real),
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        before: State,
+        dof_gradient: wp.array3d(dtype=real),
+        leaves: wp.array2d(dtype=wp.uint8),
+        mass: wp.array2d(dtype=mass_type),
+        rotary: wp.array2d(dtype=real),
+        resisted: wp.array2d(dtype=Inertia),
+        count: wp.array(dtype=int),
+        inert: int,
+        rate: wp.array(dtype=real),
+        out: State,
+        rate_out: wp.array2d(dtype=real),
+    ):
+        """Add gradients; dofs outside the mask `leaves` stay at the start, so that `dof_gradient` is a gradient by the start."""
+        i, j = wp.tid()
+        island, k = items(i, j)
+        if k >= count[island] or k >= inert:
+            return
+        velocity = dofs(end.v, end.omega, k, island)
+        ended = wp.cw_mul(rate_weight(masses(mass, rotary, k, island), resisted, k, island), velocity)
+        by_x = dofs(out.x, out.theta, k, island)
+        by_x += free_components(int(leaves[k, island]), row_of(dof_gradient, k, island))
+        by_x -= (dofs(end.x, end.theta, k, island) + row_of(more, k, island)) * start_weight
+        store(out.x, out.theta, k, island, by_x - ended * rate[island])
+        by_v = dofs(out.v, out.omega, k, island) - (ended - velocity) * start_weight
+        store(out.v, out.omega, k, island, by_v)
+        step = dofs(x, theta, k, island) - dofs(before.x, before.theta, k, island)
+        rate_out[k, island] = rate_out[k, island] + wp.dot(ended, step)
+
+    return solution, inertia, start
 
 
 @cache
