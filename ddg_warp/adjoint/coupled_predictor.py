@@ -89,7 +89,7 @@ class CoupledPredictor:
         coupled, iterates, islands = self.coupled, self._iterates, self._islands
         islands.iterate_action.zero_()
         points, kept = coupled.points, coupled.common(self._system.masks.kept)
-        inputs = [points(before.q), points(before.v), None, None, None, kept, coupled.count, coupled.world]
+        inputs = [coupled.node_state(before), None, kept, coupled.count, coupled.world]
         inputs += [self._dt, self._none, self._none, *islands.arrays]
         written = [points(iterates.q), None, None, points(iterates.base), points(iterates.target), None]
         self._launch(self._begin, coupled.node_threads, inputs, written)

@@ -79,7 +79,7 @@ class RodPredictor:
         wp.launch(
             self._begin,
             group.node_threads,
-            [before.x, before.v, before.theta, before.omega, before.frame, group.fixed, group.count, group.world]
+            [group.node_state(before), before.frame, group.fixed, group.count, group.world]
             + [self._dt, self._none, self._none, *islands.arrays],
             [self.x, self._theta, self.frame, None, self._target, self._target_angle],
             device=self.model.wp_device,

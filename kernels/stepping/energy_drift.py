@@ -20,7 +20,7 @@ import warp as wp
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.islands import INVERSE_STEP, STATUS, STEP_PROGRESS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.core.nodes import NodeStorage
+from ddg_warp.kernels.core.nodes import NodeStorage, dof_functions, mass_functions, state_type
 from ddg_warp.kernels.elements.element_path import ElementStorage, parameter_function
 from ddg_warp.kernels.elements.rod_layout import drag_structure
 from ddg_warp.kernels.forces.drag import block_inertia
@@ -154,39 +154,20 @@ def node_kernel(nodes: NodeStorage, real, drag: bool):
 
     `measure`: sum work of follower loads, kinetic energy at the end, and dissipation by damping and drag, over the nodes first,
     first + ranges, ... of an island.
-
-    Masses are a scalar a node of a rod, a vector a dof block.
     """
-    twist, coupled = nodes.twist, nodes.coupled
-    V, B, (items, _) = wp.types.vector(nodes.dim, real), wp.types.vector(ROWS, real), nodes.thread_functions
-    M = V if coupled else real
-    Inertia = (block_inertia(real) if coupled else drag_structure(nodes.dim, real)) if drag else M
-
-    @wp.func
-    def mass_of(inertia: Inertia):
-        if wp.static(drag):
-            return inertia.mass
-        else:
-            return inertia
-
-    @wp.func
-    def square(m: M, v: V):
-        """Return m v . v."""
-        if wp.static(coupled):
-            return wp.dot(wp.cw_mul(m, v), v)
-        else:
-            return m * wp.length_sq(v)
+    V, M, B = wp.types.vector(nodes.dim, real), nodes.mass_type(real), wp.types.vector(ROWS, real)
+    State, (items, _), twist = state_type(nodes, real), nodes.thread_functions, nodes.twist
+    (dofs, _), (masses, _) = dof_functions(nodes, real), mass_functions(nodes, real)
+    Inertia = block_inertia(real) if nodes.coupled else drag_structure(nodes.dim, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def measure(
-        x0: wp.array2d(dtype=V),
-        v0: wp.array2d(dtype=V),
-        theta0: wp.array2d(dtype=real),
-        omega0: wp.array2d(dtype=real),
+        before: State,
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
-        mass: wp.array2d(dtype=Inertia),
+        mass: wp.array2d(dtype=M),
         rotary: wp.array2d(dtype=real),
+        resisted: wp.array2d(dtype=Inertia),
         count: wp.array(dtype=int),
         load: wp.array2d(dtype=V),
         load_angle: wp.array2d(dtype=real),
@@ -199,7 +180,7 @@ def node_kernel(nodes: NodeStorage, real, drag: bool):
         ranges: int,
         rows_out: wp.array3d(dtype=real),
     ):
-        """Sum rows; `load` is the load at the iterate x, `load_solved` the load of the solve."""
+        """Sum rows; `load` is the load at the iterate x, `load_solved` the load of the solve, `resisted` inertia and drag."""
         i, j = wp.tid()
         island, first = items(i, j)
         if scalars[STEP_PROGRESS, island] >= real(1.0):
@@ -207,29 +188,23 @@ def node_kernel(nodes: NodeStorage, real, drag: bool):
         rate = real(2.0) * scalars[INVERSE_STEP, island]
         total = B()
         for k in range(first, count[island], ranges):
-            m = mass_of(mass[k, island])
-            moved = x[k, island] - x0[k, island]
-            kinetic = real(0.5) * square(m, moved * rate - v0[k, island])
-            damped = damping[0] * rate * square(m, moved)
-            rotated = real(0.0)
-            if wp.static(twist):
-                rotated = theta[k, island] - theta0[k, island]
-                spin = rotated * rate - omega0[k, island]
-                kinetic += real(0.5) * rotary[k, island] * spin * spin
-                damped += damping[0] * rate * rotary[k, island] * rotated * rotated
+            m = masses(mass, rotary, k, island)
+            moved = dofs(x, theta, k, island) - dofs(before.x, before.theta, k, island)
+            v = moved * rate - dofs(before.v, before.omega, k, island)
+            kinetic = real(0.5) * wp.dot(wp.cw_mul(m, v), v)
+            damped = damping[0] * rate * wp.dot(wp.cw_mul(m, moved), moved)
             if wp.static(drag):
-                away = x[k, island] - mass[k, island].carried
-                damped += real(2.0) * wp.dot(away, mass[k, island].resistance * away)
+                away = x[k, island] - resisted[k, island].carried
+                damped += real(2.0) * wp.dot(away, resisted[k, island].resistance * away)
                 if wp.static(twist):
-                    damped += real(2.0) * mass[k, island].spin * rotated * rotated
+                    rotated = moved[wp.static(nodes.dim)]
+                    damped += real(2.0) * resisted[k, island].spin * rotated * rotated
             made = real(0.0)
             worked = real(0.0)
             if follows != 0:
-                made = wp.dot(load_solved[k, island] - load[k, island], moved)
-                worked = wp.abs(wp.dot(load[k, island], moved))
-                if wp.static(twist):
-                    made += (load_angle_solved[k, island] - load_angle[k, island]) * rotated
-                    worked += wp.abs(load_angle[k, island] * rotated)
+                force = dofs(load, load_angle, k, island)
+                made = wp.dot(dofs(load_solved, load_angle_solved, k, island) - force, moved)
+                worked = wp.abs(wp.dot(force, moved))
             total += B(real(2.0) * made, real(2.0) * floor * worked, kinetic, damped)
         for row in range(wp.static(ROWS)):
             rows_out[row, first, island] = total[row]

@@ -38,7 +38,7 @@ from ddg_warp.kernels.core.islands import (
     attempt_functions,
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.core.nodes import NodeStorage
+from ddg_warp.kernels.core.nodes import NodeStorage, dof_functions, state_type
 from ddg_warp.kernels.stepping.warm_start import extrapolation_rate_function
 
 
@@ -53,15 +53,13 @@ def begin_kernel(nodes: NodeStorage, real, midpoint: bool):
     edges, from `base`, the last state.
     """
     length, restart = attempt_functions(real, midpoint)
-    dim, twist, coupled = nodes.dim, nodes.twist, nodes.coupled
-    V, (items, until) = wp.types.vector(dim, real), nodes.thread_functions
+    block, twist, coupled = nodes.block, nodes.twist, nodes.coupled
+    V, State, (dofs, store) = wp.types.vector(nodes.dim, real), state_type(nodes, real), dof_functions(nodes, real)
+    items, until = nodes.thread_functions
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def begin(
-        x0: wp.array2d(dtype=V),
-        v0: wp.array2d(dtype=V),
-        theta0: wp.array2d(dtype=real),
-        omega0: wp.array2d(dtype=real),
+        before: State,
         frame0: wp.array3d(dtype=real),
         kept: wp.array2d(dtype=wp.uint8),
         count: wp.array(dtype=int),
@@ -98,29 +96,23 @@ def begin_kernel(nodes: NodeStorage, real, midpoint: bool):
         predict_length = wp.where(flags[COLD_START, island] == 0, s, real(0.0))
         for k in range(first, until(first, n)):
             mask = int(kept[k, island])
-            start = x0[k, island]
-            v = v0[k, island]
-            target_out[k, island] = start + v * (rate / coefficient)
+            start = dofs(before.x, before.theta, k, island)
+            v = dofs(before.v, before.omega, k, island)
+            store(target_out, target_angle_out, k, island, start + v * (rate / coefficient))
             predicted = start
-            for d in range(wp.static(dim)):
+            for d in range(wp.static(block)):
                 if ((mask >> d) & 1) == 0:
                     predicted[d] = predicted[d] + predict_length * v[d]
-            x_out[k, island] = predicted
+            store(x_out, theta_out, k, island, predicted)
             if wp.static(coupled):
                 base_out[k, island] = start
             else:
                 if flags[COLD_START, island] == 0 and k + 1 < n:
-                    edge_change = (v0[k + 1, island] - v) * s
-                    edge = x0[k + 1, island] - start
+                    edge_change = (before.v[k + 1, island] - before.v[k, island]) * s
+                    edge = before.x[k + 1, island] - before.x[k, island]
                     if wp.length_sq(edge_change) > straight * straight * wp.length_sq(edge):
                         flags[ROTATE_PREDICTOR, island] = 1
             if wp.static(twist):
-                angle = theta0[k, island]
-                spin = omega0[k, island]
-                target_angle_out[k, island] = angle + spin * (rate / coefficient)
-                if ((mask >> wp.static(dim)) & 1) == 0:
-                    angle += predict_length * spin
-                theta_out[k, island] = angle
                 for c in range(7):
                     frame_out[c, k, island] = frame0[c, k, island]
 
@@ -165,17 +157,15 @@ def finish_kernel(nodes: NodeStorage, real, midpoint: bool, contact: bool = Fals
     In the coupled system `trust` scales accelerations, and the rate of inertia in contact is stored if `rate_out` has entries.
     `contact`: see `crowd` of `extrapolation_rate_function`.
     """
-    twist, coupled, extrapolation_of = nodes.twist, nodes.coupled, extrapolation_rate_function(real, midpoint, contact)
-    V, (items, until) = wp.types.vector(nodes.dim, real), nodes.thread_functions
+    coupled, extrapolation_of = nodes.coupled, extrapolation_rate_function(real, midpoint, contact)
+    V, State, (dofs, store) = wp.types.vector(nodes.dim, real), state_type(nodes, real), dof_functions(nodes, real)
+    items, until = nodes.thread_functions
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def finish(
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
-        x0: wp.array2d(dtype=V),
-        v0: wp.array2d(dtype=V),
-        theta0: wp.array2d(dtype=real),
-        omega0: wp.array2d(dtype=real),
+        before: State,
         a0: wp.array2d(dtype=V),
         alpha0: wp.array2d(dtype=real),
         predicted: wp.array2d(dtype=V),
@@ -185,10 +175,7 @@ def finish_kernel(nodes: NodeStorage, real, midpoint: bool, contact: bool = Fals
         count: wp.array(dtype=int),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
-        x_out: wp.array2d(dtype=V),
-        v_out: wp.array2d(dtype=V),
-        theta_out: wp.array2d(dtype=real),
-        omega_out: wp.array2d(dtype=real),
+        out: State,
         a_out: wp.array2d(dtype=V),
         alpha_out: wp.array2d(dtype=real),
         rate_out: wp.array(dtype=real),
@@ -210,43 +197,22 @@ def finish_kernel(nodes: NodeStorage, real, midpoint: bool, contact: bool = Fals
         if wp.static(coupled):
             extrapolation *= trust[island]
         for k in range(first, until(first, n)):
-            before = x0[k, island]
-            v = v0[k, island]
-            a = a0[k, island]
-            angle0 = real(0.0)
-            spin = real(0.0)
-            alpha = real(0.0)
-            if wp.static(twist):
-                angle0 = theta0[k, island]
-                spin = omega0[k, island]
-                alpha = alpha0[k, island]
-            end = before
-            angle = angle0
+            start = dofs(before.x, before.theta, k, island)
+            v = dofs(before.v, before.omega, k, island)
+            a = dofs(a0, alpha0, k, island)
+            end = start
             if moves:
-                end = x[k, island]
-                a = (end - predicted[k, island]) * extrapolation
-                change = (end - before) * scalars[INVERSE_STEP, island]
+                end = dofs(x, theta, k, island)
+                a = (end - dofs(predicted, predicted_angle, k, island)) * extrapolation
+                change = (end - start) * scalars[INVERSE_STEP, island]
                 if wp.static(midpoint):
-                    end = real(2.0) * end - before
+                    end = real(2.0) * end - start
                     v = real(2.0) * change - v
                 else:
                     v = change
-                if wp.static(twist):
-                    angle = theta[k, island]
-                    alpha = (angle - predicted_angle[k, island]) * extrapolation
-                    spin_mean = (angle - angle0) * scalars[INVERSE_STEP, island]
-                    if wp.static(midpoint):
-                        angle = real(2.0) * angle - angle0
-                        spin = real(2.0) * spin_mean - spin
-                    else:
-                        spin = spin_mean
-            x_out[k, island] = end
-            v_out[k, island] = v
-            a_out[k, island] = a
-            if wp.static(twist):
-                theta_out[k, island] = angle
-                omega_out[k, island] = spin
-                alpha_out[k, island] = alpha
+            store(out.x, out.theta, k, island, end)
+            store(out.v, out.omega, k, island, v)
+            store(a_out, alpha_out, k, island, a)
 
     return finish
 

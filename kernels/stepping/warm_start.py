@@ -20,7 +20,7 @@ from ddg_warp.kernels.core.islands import (
     STEP_PROGRESS,
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.core.nodes import NodeStorage
+from ddg_warp.kernels.core.nodes import NodeStorage, dof_functions
 from ddg_warp.kernels.elements.rod_layout import RodKind
 from ddg_warp.kernels.newton.edge_rotation import EXTRAPOLATE_ROTATED, loose_function
 from ddg_warp.kernels.newton.rod_iterate import ROTATE_EDGES, search_functions
@@ -72,9 +72,9 @@ def warm_start_kernel(nodes: NodeStorage, real, linear):
 
     Islands with rotated edges take them as a `direction`; see `further_kernel` and `ddg_warp.solve.newton.edge_rotation`.
     """
-    dim, twist, coupled = nodes.dim, nodes.twist, nodes.coupled
-    V, (items, until) = wp.types.vector(dim, real), nodes.thread_functions
-    squared_step, loose = extrapolation_step_function(real), loose_function(dim, real)
+    dim, coupled, (items, until) = nodes.dim, nodes.coupled, nodes.thread_functions
+    V, (dofs, store) = wp.types.vector(dim, real), dof_functions(nodes, real)
+    squared_step, loose = extrapolation_step_function(real), loose_function(nodes.block, real)
 
     @wp.func
     def rotates(flags: wp.array2d(dtype=int), island: int):
@@ -103,19 +103,13 @@ def warm_start_kernel(nodes: NodeStorage, real, linear):
             return
         weight = squared_step(flags, scalars, island)
         for k in range(first, until(first, n)):
-            mask = int(fixed[k, island])
-            position = x[k, island]
-            predicted[k, island] = position
-            correction = loose(mask, weight * a0[k, island])
-            x[k, island] = position + correction
+            start = dofs(x, theta, k, island)
+            store(predicted, predicted_angle, k, island, start)
+            correction = loose(int(fixed[k, island]), weight * dofs(a0, alpha0, k, island))
+            store(x, theta, k, island, start + correction)
             if rotates(flags, island):
                 for d in range(wp.static(dim)):
                     direction[d, k, island] = linear(correction[d])
-            if wp.static(twist):
-                angle = theta[k, island]
-                predicted_angle[k, island] = angle
-                if ((mask >> wp.static(dim)) & 1) == 0:
-                    theta[k, island] = angle + weight * alpha0[k, island]
 
     return foresee
 

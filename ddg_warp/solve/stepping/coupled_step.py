@@ -245,8 +245,8 @@ class CoupledStep(StepDriver):
         wp.launch(
             self._begin,
             coupled.node_threads,
-            [points(before.q), points(before.v), None, None, None, coupled.common(system.masks.kept), coupled.count]
-            + [coupled.world, self.integrator._dt, self.damping, solver.loading.scale, *islands.arrays],
+            [coupled.node_state(before), None, coupled.common(system.masks.kept), coupled.count, coupled.world]
+            + [self.integrator._dt, self.damping, solver.loading.scale, *islands.arrays],
             [points(iterates.q), None, None, points(iterates.base), points(iterates.target), None],
             device=self.model.wp_device,
         )
@@ -283,10 +283,10 @@ class CoupledStep(StepDriver):
         wp.launch(
             self._finish,
             coupled.node_threads,
-            [points(q), None, points(before.q), points(before.v), None, None, points(before.a), None]
+            [points(q), None, coupled.node_state(before), points(before.a), None]
             + [points(self._foresight.predicted), None, self._foresight.trust, rate, coupled.count]
             + self.islands.arrays,
-            [points(after.q), points(after.v), None, None, points(after.a), None, after.rate],
+            [coupled.node_state(after), points(after.a), None, after.rate],
             device=self.model.wp_device,
         )
         if self.drag:

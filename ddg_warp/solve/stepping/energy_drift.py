@@ -119,8 +119,15 @@ class RodEnergy(_Energy):
         states = [group.element_inputs(state, start.last, step.islands.inverse_step) for state in (before, newton)]
         read = [*states, device_arrays.columns(newton.stiffness), scalars, *common]
         self._launch(self._elements[0], grid, read, [self.rows[:, : self.ranges]])
-        read = [before.x, before.v, before.theta, before.omega, newton.x, newton.theta, newton.mass, group.rotary]
-        read += [group.count, *self._loads, newton.load, newton.load_angle, int(self._follows)]
+        read = [group.node_state(before), newton.x, newton.theta, group.mass, group.rotary]
+        read += [
+            newton.mass if group.kind.drag else None,
+            group.count,
+            *self._loads,
+            newton.load,
+            newton.load_angle,
+            int(self._follows),
+        ]
         self._launch(self._nodes, grid, [*read, scalars, step.damping, *common], [self.rows[:, self.ranges :]])
         self._enter()
 
@@ -161,8 +168,8 @@ class CoupledEnergy(_Energy):
         follows = bool(coupled.host.followers)
         if follows:
             step.loads.apply(points(q), points(self._load), coupled.angles(self._load))
-        read = [points(before.q), points(before.v), None, None, points(q), None]
-        read += [loading.mass.transpose((1, 0)), None, coupled.count]
+        read = [coupled.node_state(before), points(q), None, coupled.mass.transpose((1, 0)), None]
+        read += [loading.mass.transpose((1, 0)) if step.drag else None, coupled.count]
         read += [points(self._load), None, points(loading.force), None, int(follows)]
         read += [scalars, step.damping, self.floor, coupled.blocks]
         self._launch(self._nodes, (coupled.worlds, coupled.blocks), read, [self._rows[-1]])

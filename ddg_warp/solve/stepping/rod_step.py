@@ -65,7 +65,7 @@ class RodStep(StepDriver):
         self._launch(
             self._begin,
             group.node_threads,
-            [before.x, before.v, before.theta, before.omega, before.frame, group.fixed, group.count, group.world]
+            [group.node_state(before), before.frame, group.fixed, group.count, group.world]
             + [self.integrator._dt, self.damping, self.outer, *self.islands.arrays],
             [newton.x, newton.theta, newton.frame, None, newton.target, newton.target_angle],
         )
@@ -105,9 +105,9 @@ class RodStep(StepDriver):
         self._launch(
             self._nodes,
             group.node_threads,
-            [newton.x, newton.theta, before.x, before.v, before.theta, before.omega, before.a, before.alpha]
+            [newton.x, newton.theta, group.node_state(before), before.a, before.alpha]
             + [self._predicted, self._predicted_angle, None, None, group.count, *self.islands.arrays],
-            [after.x, after.v, after.theta, after.omega, after.a, after.alpha, None],
+            [group.node_state(after), after.a, after.alpha, None],
         )
         if self.drag:
             self.drag.settle(before, after, newton, self.islands)
