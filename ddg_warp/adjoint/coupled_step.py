@@ -1,4 +1,8 @@
-"""Reverse of a step of the coupled system; see `ddg_warp.adjoint.implicit`."""
+"""Reverse of a step of the coupled system; see `ddg_warp.adjoint.implicit`.
+
+Why not shared with `ddg_warp.adjoint.rod_step`: kernels over elements and nodes are. Rods write windows that nodes gather, while here
+contributions are assembled by lists, and friction lags solve several times.
+"""
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise

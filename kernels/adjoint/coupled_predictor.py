@@ -1,4 +1,8 @@
-"""Vector-Jacobian product of rod predictors in the coupled system, by level; see `kernels.adjoint.edge_rotation`."""
+"""Vector-Jacobian product of rod predictors in the coupled system, by level; see `kernels.adjoint.edge_rotation`.
+
+Why not shared with `kernels.adjoint.rod_predictor`: there one thread a rod does all in one launch. Here anchors may be nodes of other
+rods, so that gradients pass through levels of the rod order.
+"""
 
 from functools import cache
 

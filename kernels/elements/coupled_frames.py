@@ -1,6 +1,9 @@
 """Time-lagged data of the coupled system: frames of rod edges, and lagged rows of measures.
 
 Worlds in which `moved` is not `wanted` copy the `kept` data.
+
+Why not shared with frames of uncoupled rods: `kernels.stepping.rod_step` and `kernels.newton.rod_iterate` update both edges of a vertex
+in one kernel. Here edges and lagged rows of measures take a kernel each, as several elements may meet at an edge.
 """
 
 from functools import cache

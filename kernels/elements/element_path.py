@@ -3,7 +3,8 @@
 A kernel reads the local dofs of an element, evaluates strains and Jacobian, and writes columns. Storages differ in where dofs lie
 and which thread takes which element. An `ElementStorage` holds these as Warp functions that are chosen when a kernel is built.
 `kernels.elements.rod_layout.rod_storage` is that of uncoupled rods, `kernels.elements.coupled_element.coupled_storage` that of the
-coupled system. `kernels.adjoint.elements` and `kernels.stepping.energy_drift` are written over the same storages.
+coupled system. `kernels.adjoint.elements` and `kernels.stepping.energy_drift` are written over the same storages. For kernels over
+nodes see `kernels.core.nodes`.
 
 Alternative: one source for the solvers around elements. It is separate where the algorithms differ. Residuals have other stopping
 rules: sums over a whole rod, or over hierarchical clusters. The line search of rods is fused with their sweep, one thread a rod and

@@ -14,6 +14,9 @@ Within a time step tangents and coefficients are constant, so that drag has a po
 its edges. The fluid alone would carry it to a = x_n + s u in a solve of length s, and the energy is (x - a) . D (x - a) / 2 s. A body
 at a node, such as a ball, adds c I to D. The potential is assembled with inertia. Angles have the same mass-like quadratic: drag and
 rotary inertia make one, about a mean target.
+
+Why not shared by rods and the coupled system: `resist` reads the two edges of a node, or a list of edges. A rod adds drag on angles to
+its rotary inertia, while angles of the coupled system have a resistance. One kernel `settle` would take as many lines as two.
 """
 
 from functools import cache

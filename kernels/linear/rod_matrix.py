@@ -3,6 +3,9 @@
 Node k has the blocks D_k, E_k (coupling to node k + 1) and F_k (to node k + 2; modulo the nodes of a closed rod), in one array of 3
 nb^2 rows: [component][node][rod]. One thread gathers a block, so that sums have a fixed order, without atomics. Rows and columns of
 fixed dofs are rows and columns of the identity.
+
+Why not shared with `kernels.linear.rod_band_assembly`: blocks here have the dofs of a node of one kind of rod, from one window of all
+terms. Blocks there sum element sets found by index and positions of H, with dofs and tensions of joined rods.
 """
 
 from functools import cache

@@ -3,6 +3,9 @@
 An iteration computes H p (one thread a node), then step length, update of solution and residual, preconditioning, test and new
 direction (one thread a rod). Residuals are measured in the norm of the preconditioner, relative to the first. Curvature that is not
 positive beyond rounding ends a solve with the solution so far.
+
+Why not shared with `kernels.linear.coupled_pcg`: one thread a rod takes all sums and preconditions between two products. In the coupled
+system sums run over tiles of dof blocks, and preconditioners are launches of their own.
 """
 
 from functools import cache

@@ -17,6 +17,9 @@ Measured: iterations to a residual of 1e-3 for the gridshell of `scenes.gridshel
 32 edges between crossings: block Jacobi 43, 250, 2378, additive overlapping rods 14, 35, 51, this 13, 16, 16.
 
 Columns of paths are counted world by world; a solve for colour and dof d is in column d * columns + r.
+
+Why not shared with `kernels.newton.rod_sweep` and `kernels.linear.cyclic_reduction`: paths are solved once an iteration of PCG, for
+several right-hand sides from stored factors. The sweep eliminates once an iteration of Newton's method and forms its blocks itself.
 """
 
 from functools import cache

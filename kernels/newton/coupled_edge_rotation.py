@@ -1,6 +1,9 @@
 """Edge-rotation update of rods in the coupled system, for Newton steps and predictors; see `kernels.newton.edge_rotation`.
 
 Rotated edges are summed along pieces of a rod, then over its pieces, then from anchors, so that a long rod has many threads.
+
+Why not shared with `kernels.newton.rod_iterate`: there one thread rotates a whole rod from its own fixed nodes. Here a rod may start at
+a node of another rod, so that rods are updated level by level.
 """
 
 from functools import cache

@@ -2,6 +2,9 @@
 
 Sums over a rod run over fixed ranges of about the square root of its nodes, one thread a range, then over the ranges, one thread a
 rod. The order of summation is fixed.
+
+Why not shared with `kernels.newton.coupled_newton`: two launches sum and decide for each rod, and repeat indefinite iterates. There
+tiles of dof blocks are summed, and decisions set forcing terms of PCG, allow contact to cut steps, and excuse bodies.
 """
 
 from functools import cache

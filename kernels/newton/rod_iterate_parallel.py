@@ -2,6 +2,9 @@
 
 A prefix sum maps rotated edges to positions. It runs within ranges of about the square root of a rod's nodes, one thread a range,
 then over the ranges, one thread a rod.
+
+Why not shared with `kernels.newton.coupled_edge_rotation`: four launches here rotate edges, move straight, or update frames and twist
+angles, in the plane and in space. The coupled form takes at least two launches more an iteration, and reads indices of path nodes.
 """
 
 from functools import cache

@@ -9,6 +9,9 @@ back and takes the next step. Physics enters as factor rows only.
 
 Line search (Armijo, c = 1e-4) on the energy, summed as differences per element. If the predicted decrease is below the rounding
 floor, a smaller r^T H^-1 r accepts instead (natural monotonicity test; Deuflhard, Newton Methods for Nonlinear Problems, 2004).
+
+Why not shared with `kernels.newton.coupled_newton`: one thread a rod eliminates, decides and moves in one launch an iteration. A world
+of the coupled system needs sums over all dof blocks and an iterative solve between these, each in launches of its own.
 """
 
 from functools import cache

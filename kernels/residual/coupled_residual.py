@@ -1,6 +1,9 @@
 """Residual at dof blocks of the coupled system, and energy change of a step; see `kernels.residual.rod_residual`.
 
 Incidence lists give sums a fixed order, without atomics.
+
+Why not shared with `kernels.residual.rod_residual`: rods test sums of residuals by a limit over the number of nodes until a whole step,
+the coupled system by clusters of each body. Rounding bounds and energy changes are summed differently, too.
 """
 
 from functools import cache

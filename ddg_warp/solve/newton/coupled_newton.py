@@ -1,4 +1,8 @@
-"""Newton's method on the coupled system by preconditioned conjugate gradients; one device-side loop a world."""
+"""Newton's method on the coupled system by preconditioned conjugate gradients; one device-side loop a world.
+
+Why not shared with `ddg_warp.solve.newton.rod_newton`: that host launches evaluation, check and a fused sweep of one group. This one
+assembles element sets, selects a preconditioner, iterates PCG, and leaves hooks for contact and friction.
+"""
 
 from functools import partial
 

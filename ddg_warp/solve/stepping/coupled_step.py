@@ -1,4 +1,8 @@
-"""Time step of the coupled system: predictor, prescribed motion, loads, Newton, retries. See `kernels.stepping.time_step`."""
+"""Time step of the coupled system: predictor, prescribed motion, loads, Newton, retries. See `kernels.stepping.time_step`.
+
+Why not shared with `ddg_warp.solve.stepping.rod_step`: phases and retries are, in `StepDriver`, and so are kernels over nodes.
+Data of element sets, substeps of arcs, contact and decoupled steps exist in the coupled system alone.
+"""
 
 from dataclasses import replace
 
