@@ -1,6 +1,14 @@
 """Layouts of many rods without overlap: random sequential addition and overlap resolution."""
 
+import math
+
 import numpy as np
+
+from ddg_warp.geometry import polyline
+
+PATIENCE = 200  # failures in a row, after which the box of `placed_apart` grows
+PIECES = 3  # of a rod, in the search for near ones
+BATCH = 2000  # rods that are searched together
 
 
 def random(seed: int):
@@ -17,44 +25,81 @@ def random(seed: int):
 def placed_apart(rng, count: int, length: float, separation: float, size, height: float) -> np.ndarray:
     """Return straight rods at random positions and directions in a box without overlap (random sequential addition).
 
+    Trials up to the next growth of the box are tested together, and accepted in their order.
+
     Args:
         rng: random generator.
         count: number of rods.
         length: length of a rod [m].
-        apart: least distance of two axes, and half of it of an axis and the box [m].
+        separation: least distance of two axes, and half of it of an axis and the box [m].
         size: the box is 0 <= x <= size[0], 0 <= y <= size[1] [m].
         height: initial height of the box [m]; it grows where no room is left.
 
     Returns:
         First and last points (count, 2, 3) [m], at heights of 0 or more.
     """
-    placed, half = np.empty((count, 2, 3)), 0.5 * separation
-    slabs: dict[int, list[int]] = {}
-    done, tried = 0, 0
+    placed, done, failed = np.empty((count, 2, 3)), 0, 0
+    batches = []  # all but the last placed rods
     while done < count:
-        direction = rng.normal(size=3)
-        direction *= length / np.linalg.norm(direction)
-        spare = np.array([*size, height]) - 2.0 * half - np.abs(direction)
-        tried += 1
-        if tried > 200:  # no room is left
-            tried, height = 0, height + 0.25 * length
-        if (spare < 0.0).any():
-            continue
-        start = half + rng.uniform(size=3) * spare + np.maximum(0.0, -direction)
-        end = start + direction
-        slab = int(0.5 * (start[2] + end[2]) // length)
-        near = [i for k in (slab - 1, slab, slab + 1) for i in slabs.get(k, ())]
-        if near and distances(start, end, placed[near]).min() < separation:
-            continue
-        placed[done] = start, end
-        slabs.setdefault(slab, []).append(done)
-        done, tried = done + 1, 0
+        trials = PATIENCE + 1 - failed
+        trial, rods = _trials(rng, trials, length, separation, np.array([*size, height]))
+        last = BATCH * len(batches)
+        for batch in (*batches, _pieces(placed[last:done])):
+            free = np.delete(np.arange(len(rods)), _overlaps(_pieces(rods), batch, separation)[0])
+            trial, rods = trial[free], rods[free]
+        taken: set[int] = set()
+        earlier: list[list] = [[] for _ in rods]
+        for rod, other in zip(*_overlaps(_pieces(rods), _pieces(rods), separation).tolist(), strict=True):
+            earlier[rod] += [other] * (other < rod)
+        for rod, others in enumerate(earlier):
+            taken |= {rod} if taken.isdisjoint(others) else set()
+        accepted = sorted(taken)[: count - done]
+        placed[done : done + len(accepted)] = rods[accepted]
+        done += len(accepted)
+        batches += [_pieces(placed[last : last + BATCH])] if done - last >= BATCH else []
+        if not accepted or trial[accepted[0]] == trials - 1:  # no room is left
+            failed, height = 0, height + 0.25 * length
+        else:
+            failed = trials - 1 - trial[accepted[-1]]
     return placed
+
+
+def _trials(rng, count: int, length: float, separation: float, size) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers (n,) of the trials that fit into a box, of `count`, and their first and last points (n, 2, 3)."""
+    room, trial, directions, places = size - separation, [], [], []
+    for number in range(count):
+        direction = rng.normal(size=3)
+        direction *= length / math.sqrt(direction.dot(direction))
+        if (np.abs(direction) <= room).all():
+            trial.append(number)
+            directions.append(direction)
+            places.append(rng.uniform(size=3))
+    direction, place = (np.array(values).reshape(-1, 3) for values in (directions, places))
+    start = 0.5 * separation + place * (room - np.abs(direction)) + np.maximum(0.0, -direction)
+    return np.array(trial, int), np.stack([start, start + direction], axis=1)
+
+
+def _pieces(rods: np.ndarray) -> tuple:
+    """Return straight rods (n, 2, 3) and the tree of the middles of `PIECES` equal pieces of each, rod by rod."""
+    from scipy.spatial import cKDTree
+
+    along = (np.arange(PIECES)[:, None] + 0.5) / PIECES
+    middles = rods[:, :1] + along * (rods[:, 1:] - rods[:, :1])
+    return rods, cKDTree(middles.reshape(-1, 3), balanced_tree=False)
+
+
+def _overlaps(first: tuple, second: tuple, separation: float) -> np.ndarray:
+    """Return pairs (2, n) of rods of one length, of two results of `_pieces`, that are closer than `separation`."""
+    (rods, tree), (others, others_tree) = first, second
+    within = np.linalg.norm(np.diff(rods, axis=1), axis=-1).max(initial=0.0) / PIECES + separation
+    near = tree.sparse_distance_matrix(others_tree, 1.001 * within, output_type="ndarray")
+    pairs = np.stack([near["i"], near["j"]]) // PIECES
+    return pairs[:, distances(*rods[pairs[0]].swapaxes(0, 1), others[pairs[1]]) < separation]
 
 
 def distances(start: np.ndarray, end: np.ndarray, segments: np.ndarray) -> np.ndarray:
     """Return distances (n,) of a segment, or of n segments, from segments (n, 2, 3); none is a point."""
-    return np.linalg.norm(_between(start, end, *np.moveaxis(segments, 1, 0))[0], axis=1)
+    return polyline.length(_between(start, end, *np.moveaxis(segments, 1, 0))[0])
 
 
 def _between(a, b, c, d) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -63,8 +108,8 @@ def _between(a, b, c, d) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Source: Ericson, Real-Time Collision Detection, 5.1.9.
     """
     u, v, r = b - a, d - c, a - c
-    uu, vv, uv = (u * u).sum(-1), (v * v).sum(-1), (u * v).sum(-1)
-    ur, vr = (u * r).sum(-1), (v * r).sum(-1)
+    dot = polyline.dot
+    uu, vv, uv, ur, vr = dot(u, u), dot(v, v), dot(u, v), dot(u, r), dot(v, r)
     s = np.clip((uv * vr - ur * vv) / np.maximum(uu * vv - uv * uv, 1e-12 * uu * vv), 0.0, 1.0)
     t = np.clip((uv * s + vr) / vv, 0.0, 1.0)
     s = np.clip((uv * t - ur) / uu, 0.0, 1.0)

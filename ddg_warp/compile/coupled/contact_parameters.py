@@ -24,25 +24,22 @@ def contact_parameters(scene, coupled: CoupledSystem) -> ContactParameters | Non
     law = scene.touching
     if law is None:
         return None
-    names, bodies, forces = contact_names(scene), [], []
+    names, bodies, forces, sections = contact_names(scene), [], [], {}
     for rod in coupled.rods:
         batch = rod.piece.batch
         if batch.name in names:
-            row = rod.rod - batch.first
-            radius = law.radius.get(batch.name)
-            if radius is None:
-                radius = _radius(batch, row, rod.rod)
+            if batch.first not in sections:
+                sections[batch.first] = _radii_and_forces(batch, law.radius.get(batch.name))
             if law.rolling and not rod.edges.size:
                 raise SceneError(
                     f"contact: rolling, and rod {rod.rod} ('{batch.name}') has no twist, by which it would roll; leave rolling out, or "
                     "give the rod twist"
                 )
             angles = rod.edges if law.rolling else rod.edges[:0]
+            radius, elastic = (values[rod.rod - batch.first] for values in sections[batch.first])
             bodies.append(
                 Body(rod.nodes, ROD, radius, batch.name, f"rod {rod.rod}", closed=batch.closed, angles=angles)
             )
-            bending = max(float(np.max(_of_rod(batch, name, row))) for name in ("EI1", "EI2"))
-            elastic = max(BENDING * bending / radius**2, LIMP * float(np.max(_of_rod(batch, "EA", row))))
             forces.append((coupled.mass[rod.nodes, 0].max(), elastic))
     for index, shell in enumerate(coupled.shells):
         if (name := shell.surface.name) in names:
@@ -70,25 +67,30 @@ def contact_parameters(scene, coupled: CoupledSystem) -> ContactParameters | Non
     return result
 
 
-def _radius(batch, row: int, rod: int) -> float:
-    """Return the contact radius of one rod of a batch, the largest of its section [m].
+def _radii_and_forces(batch, radius: float | None) -> tuple[list[float], list[float]]:
+    """Return the contact radius of every rod of a batch [m], and its elastic default force [N].
+
+    Args:
+        radius: of all rods, None for the largest of each section.
 
     Raises:
         SceneError: the section has no positive radius.
     """
-    radius = batch.section.radius
-    if radius is None or not np.all(np.asarray(radius) > 0.0):
+    own = batch.section.radius
+    if radius is None and (own is None or not np.all(np.asarray(own) > 0.0)):
         raise SceneError(
-            f"contact: rod {rod} ('{batch.name}') needs a contact radius, and its section has {radius}; give "
+            f"contact: rod {batch.first} ('{batch.name}') needs a contact radius, and its section has {own}; give "
             f"Stiffness(radius=...), positive, or contact(radius={{{batch.name!r}: ...}})"
         )
-    return float(np.max(_of_rod(batch, "radius", row)))
+    radii = _largest(batch, "radius") if radius is None else np.full(batch.rods, radius)
+    bending = np.maximum(_largest(batch, "EI1"), _largest(batch, "EI2"))
+    elastic = np.maximum(BENDING * bending / radii**2, LIMP * _largest(batch, "EA"))
+    return radii.tolist(), elastic.tolist()
 
 
-def _of_rod(batch, name: str, row: int) -> np.ndarray:
-    """Return a section property of one rod of a batch."""
-    values = np.asarray(getattr(batch.section, name), float)
-    return values[row] if values.ndim == 2 and len(values) > 1 else values
+def _largest(batch, name: str) -> np.ndarray:
+    """Return the largest value of a section property along every rod of a batch (R,)."""
+    return np.broadcast_to(np.atleast_2d(np.asarray(getattr(batch.section, name), float)).max(1), batch.rods)
 
 
 def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: np.ndarray) -> ContactParameters:
