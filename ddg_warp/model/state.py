@@ -173,15 +173,11 @@ class State:
 
     def points(self) -> np.ndarray:
         """Return positions (P, 3) or (worlds, P, 3) [m]: nodes in the order of `model.curves`, then vertices."""
-        return self.model.order.nodes(
-            [arrays.download(group.x) for group in self.groups], self.coupled and self.coupled.q
-        )
+        return self.model.order.nodes([group.x.numpy() for group in self.groups], self.coupled and self.coupled.q)
 
     def velocities(self) -> np.ndarray:
         """Return velocities of nodes, ordered as `points` [m/s]."""
-        return self.model.order.nodes(
-            [arrays.download(group.v) for group in self.groups], self.coupled and self.coupled.v
-        )
+        return self.model.order.nodes([group.v.numpy() for group in self.groups], self.coupled and self.coupled.v)
 
     def obstacle_points(self) -> np.ndarray:
         """Return positions of nodes of moving obstacles (M, 3) or (worlds, M, 3) [m], see `Model.obstacles`."""
@@ -198,7 +194,7 @@ class State:
         coupled = None
         if model.coupled is not None and model.coupled.edges:
             coupled = self.coupled.q.numpy().reshape(model.worlds, -1, 3)[:, model.coupled.angle_start :, 0]
-        return model.order.edges([arrays.download(data.theta) for data in self.groups], coupled)
+        return model.order.edges([data.theta.numpy() for data in self.groups], coupled)
 
     def directors(self) -> np.ndarray | None:
         """Return the first material director of edges (edges, 3) or (worlds, edges, 3); None without twist."""

@@ -1,5 +1,6 @@
 """User order of nodes and edges, and maps from there to storage of rod groups and the coupled system."""
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -69,8 +70,7 @@ class UserNumbering:
         """Rows of `State.points` from the coupled system, and the dof blocks that fill them."""
         if self.model.coupled is None:
             return np.zeros(0, int), np.zeros(0, int)
-        start = np.concatenate([[0], np.cumsum(self.curves.counts)])
-        host = self.model.coupled.host
+        start, host = self._node_starts, self.model.coupled.host
         rows = [start[rod.rod] + np.arange(len(rod.nodes)) for rod in host.rods]
         first = len(start) - 1 - len(host.meridians)
         rows += [start[first + i] + np.arange(len(shell.nodes)) for i, shell in enumerate(host.meridians)]
@@ -80,8 +80,7 @@ class UserNumbering:
 
     def places(self, group: RodGroup) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return for the nodes of a rod group: node with ghosts, column, row of `State.points`."""
-        start = np.concatenate([[0], np.cumsum(self.curves.counts)])
-        return _user_index(group, group.host.own, start)
+        return _user_index(group, group.host.own, self._node_starts)
 
     @property
     def points_count(self) -> int:
@@ -92,9 +91,14 @@ class UserNumbering:
         return int(self.curves.counts.sum()) + vertices
 
     @cached_property
+    def _node_starts(self) -> np.ndarray:
+        """Offsets of the nodes of every curve (curves + 1,)."""
+        return np.concatenate([[0], np.cumsum(self.curves.counts)])
+
+    @cached_property
     def edge_starts(self) -> np.ndarray:
         """Offsets of the edges of every curve (curves + 1,)."""
-        return np.cumsum([0, *(self.curves.counts - np.where(self.curves.closed, 0, 1))])
+        return np.concatenate([[0], np.cumsum(self.curves.counts - np.where(self.curves.closed, 0, 1))])
 
     @property
     def edges_count(self) -> int:
@@ -149,17 +153,14 @@ class UserNumbering:
 
     def edge_places(self, group: RodGroup) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return for the edges of a rod group: edge with ghosts, column, row of `State.angles`."""
-        counts = group.host.own - (0 if group.kind.closed else 1)
-        return _user_index(group, counts, self.edge_starts)
+        return _user_index(group, _edges(group), self.edge_starts)
 
     def put_nodes(self, group: RodGroup, values, out: np.ndarray, label: str) -> None:
         """Write values in user order (P, 3) to (node, column, dim) of a group."""
-        values = self._points(values, label)
-        axes = [0, 2] if group.kind.dim == 2 else [0, 1, 2]
-        k, column, index = self.places(group)
-        for world in range(self.model.worlds):
-            of_world = values if values.ndim == 2 else values[world]
-            out[k, column + world * group.rods] = of_world[index][:, axes]
+        values = self._points(values, label)[..., _axes(group)]
+        for rods in _rods_alike(group, group.host.own, self._node_starts):
+            for world in range(self.model.worlds):
+                rods.stored(out, world)[:] = rods.numbered(values if values.ndim == 2 else values[world])
 
     def put_blocks(self, values, blocks: np.ndarray, label: str) -> np.ndarray:
         """Return `blocks` (worlds N, 3) with values in user order (P, 3) filled in."""
@@ -178,10 +179,10 @@ class UserNumbering:
         return values
 
     def put_edges(self, group: RodGroup, values, out: np.ndarray, label: str = "spins") -> None:
-        values, _ = self.of_edges(values, label)
-        k, column, index = self.edge_places(group)
-        for world in range(self.model.worlds):
-            out[k, column + world * group.rods] = (values if values.ndim == 1 else values[world])[index]
+        values, start = self.of_edges(values, label)
+        for rods in _rods_alike(group, _edges(group), start):
+            for world in range(self.model.worlds):
+                rods.stored(out, world)[:] = rods.numbered(values if values.ndim == 1 else values[world])
 
     def of_edges(self, values, label: str) -> tuple[np.ndarray, np.ndarray]:
         """Return checked spins or angles in user order, and the edge offsets of rods."""
@@ -194,7 +195,6 @@ class UserNumbering:
 
     def nodes(self, values: list[np.ndarray], blocks: wp.array | None = None) -> np.ndarray:
         """Return nodal values in user order from group arrays (node, column, dim) and dof blocks (worlds N, 3)."""
-        start = np.concatenate([[0], np.cumsum(self.curves.counts)])
         out = np.zeros((self.model.worlds, self.points_count, 3))
         if blocks is not None:
             rows, indices = self.net_rows
@@ -202,10 +202,9 @@ class UserNumbering:
                 self.model.worlds, -1, 3
             )[:, indices]
         for group, value in zip(self.model.groups, values, strict=True):
-            axes = [0, 2] if group.kind.dim == 2 else [0, 1, 2]
-            k, column, index = _user_index(group, group.host.own, start)
-            for world in range(self.model.worlds):
-                out[world][index[:, None], axes] = value[k, column + world * group.rods]
+            for rods in _rods_alike(group, group.host.own, self._node_starts):
+                for world in range(self.model.worlds):
+                    rods.put(out[world][:, _axes(group)], rods.stored(value, world))
         return out[0] if self.model.worlds == 1 else out
 
     def edges(self, values: list[np.ndarray], coupled: np.ndarray | None = None, width: int = 0):
@@ -215,9 +214,9 @@ class UserNumbering:
         out = np.zeros((self.model.worlds, self.edges_count, *([width] if width else [])))
         for group, value in zip(self.model.groups, values, strict=True):
             if group.kind.twist:
-                k, column, index = self.edge_places(group)
-                for world in range(self.model.worlds):
-                    out[world][index] = value[k, column + world * group.rods]
+                for rods in _rods_alike(group, _edges(group), self.edge_starts):
+                    for world in range(self.model.worlds):
+                        rods.put(out[world], rods.stored(value, world))
         for rod in self.model.coupled.host.rods if coupled is not None else ():
             rows = self.edge_starts[rod.rod] + np.arange(len(rod.edges))
             out[:, rows] = coupled[:, rod.edges - self.model.coupled.angle_start]
@@ -249,6 +248,68 @@ def _hashable(section) -> tuple:
     return tuple(
         np.asarray(value, dtype=object if value is None else float).tobytes() for value in vars(section).values()
     )
+
+
+@dataclass(frozen=True)
+class _Rods:
+    """Consecutive rods of a group with equal nodes or edges.
+
+    Attributes:
+        group: the group; columns: of the rods.
+        first: number of ghosts before the first node; count: nodes or edges of a rod without ghosts.
+        start: index of the first node or edge of every rod in user order.
+    """
+
+    group: RodGroup
+    columns: slice
+    first: int
+    count: int
+    start: np.ndarray
+
+    def stored(self, values: np.ndarray, world: int) -> np.ndarray:
+        """Return a view (rods, count, ...) of values (node, column, ...) of a group."""
+        first = world * self.group.rods
+        columns = slice(self.columns.start + first, self.columns.stop + first)
+        return values[self.first : self.first + self.count, columns].swapaxes(0, 1)
+
+    def numbered(self, values: np.ndarray) -> np.ndarray:
+        """Return (rods, count, ...) of values in user order, a view of rods that follow each other."""
+        if self._together:
+            return values[self.start[0] :][: len(self.start) * self.count].reshape(-1, self.count, *values.shape[1:])
+        return values[self._index]
+
+    def put(self, out: np.ndarray, values: np.ndarray) -> None:
+        """Write (rods, count, ...) to values in user order."""
+        if self._together:
+            self.numbered(out)[:] = values
+        else:
+            out[self._index] = values
+
+    @cached_property
+    def _together(self) -> bool:
+        return bool((np.diff(self.start) == self.count).all())
+
+    @cached_property
+    def _index(self) -> np.ndarray:
+        return self.start[:, None] + np.arange(self.count)
+
+
+def _rods_alike(group: RodGroup, counts: np.ndarray, start: np.ndarray) -> list[_Rods]:
+    """Return the rods of a group in runs with equal counts of nodes or edges, and equal ghosts."""
+    first, start = group.host.first, start[group.host.rods]
+    ends = np.flatnonzero(np.diff(first, append=-1) | np.diff(counts, append=-1)) + 1
+    runs = [slice(*run) for run in zip([0, *ends[:-1].tolist()], ends.tolist(), strict=True)]
+    return [_Rods(group, run, int(first[run.start]), int(counts[run.start]), start[run]) for run in runs]
+
+
+def _edges(group: RodGroup) -> np.ndarray:
+    """Return the number of edges of every rod of a group without ghosts (R,)."""
+    return group.host.own - (0 if group.kind.closed else 1)
+
+
+def _axes(group: RodGroup) -> slice:
+    """Return the space components that a group has."""
+    return slice(0, 3, 2 if group.kind.dim == 2 else 1)
 
 
 def _user_index(group: RodGroup, counts: np.ndarray, start: np.ndarray):
