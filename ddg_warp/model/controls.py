@@ -74,7 +74,7 @@ def _numbers(name: str, values, shape: tuple, worlds: int) -> np.ndarray:
         raise SceneError(
             f"Controls: {name} have shape {values.shape}; they are {shape}, or {(worlds, *shape)} for each of the worlds"
         )
-    if not np.isfinite(values).all():
+    if not argument_checks.all_finite(values):
         *world, entry = np.argwhere(~np.isfinite(values))[0][: values.ndim - len(shape) + 1]
         where = f" in world {world[0]}" if world else ""
         raise SceneError(f"Controls: {name}: entry {entry}{where} is not finite; give finite numbers")
@@ -121,6 +121,8 @@ def _refuse_out_of_plane(model, inputs: dict[str, np.ndarray]) -> None:
     """Refuse controls that leave the x-z plane of planar scenes and of meridians."""
     scene = model.scene
     planar = scene.dimension == 2
+    if not planar and not scene.axisymmetric_shells:
+        return
     flat, grips = np.full(model.points_count, planar), np.full(len(model.grips), planar)
     along = [0, 1] if scene.axisymmetric_shells else [1] if planar else []
     for support in scene.ring_supports:
