@@ -214,7 +214,7 @@ def test_captured_motion_equals_uncaptured(device):
     rng = np.random.default_rng(14)
     x, move = upload(points, device), upload(0.02 * rng.normal(size=points.shape), device)
     search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
-    device_arrays.load_kernels(search.kernels, device)
+    device_arrays.load_kernels([*search.kernels, *search._impacts], device)
 
     def step():
         search.rebuild(x)

@@ -129,10 +129,10 @@ class BroadPhase:
 
     @property
     def kernels(self) -> list:
-        """Kernels to load before a capture."""
+        """Kernels to load before a capture of a step, which has no `impact`."""
         lists = [kernel for pairs in self.lists for kernel in pairs.kernels]
         boxes = [kernel for part in self._things for kernel in part.kernels]
-        return [*lists, *boxes, *self._motion, *self._impacts, *self._passes, *self._filter.kernels]
+        return [*lists, *boxes, *self._motion, *self._passes, *self._filter.kernels]
 
     @property
     def shares(self) -> wp.array:

@@ -40,7 +40,7 @@ class ContactSet(CollisionSet):
         serial = device_arrays.serial(self.device)
         self._sieve, self._pack, self._evaluate = evaluate_kernels(kind, law, real, linear, serial)
         self._exact = exact_product_kernel(kind, law, real, linear)
-        self.kernels += [self._sieve, self._evaluate, self._exact]
+        self.kernels += [self._sieve, self._evaluate]
         self.kernels += [] if serial else [self._pack]
         self.mollified = (RecomputedHessians if exact else NearParallelEdges)(self, law) if kind == EDGES else None
         self.reserve()
