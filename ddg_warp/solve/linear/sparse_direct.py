@@ -1,14 +1,16 @@
 """Sparse direct solvers: symmetric systems with inertia (SuperLU), and least-norm solutions; moderate sizes."""
 
+from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
 from scipy.linalg import qr
 from scipy.sparse import bmat, csc_matrix, csr_matrix, diags, identity
-from scipy.sparse.linalg import norm, splu
+from scipy.sparse.linalg import splu
 
 SHIFTS = (1e-13, 1e-11, 1e-9)  # shifts of a singular matrix over its largest diagonal stiffness
 
+SINGULAR = 1e10  # norm of the inverse of a scaled matrix, from which on it counts as singular
 REPEATED = 1e-15  # relative regularisation of repeated equations
 CORRECTIONS = 20  # limit of refinement steps of rounding and regularisation
 
@@ -97,21 +99,60 @@ def regular(matrix: csc_matrix, mass: np.ndarray) -> tuple[Factorisation, float]
 
 
 def shortest(matrix: csr_matrix, rhs: np.ndarray) -> np.ndarray:
-    """Return the least-norm y with A y = b by the augmented system [1, A^T; A, 0].
+    """Return the least-norm y with A y = b.
 
-    See Bjorck, Numerical methods for least squares problems, 1996. Equations may be repeated; contradictory ones leave a residual for
-    the caller to test.
+    A regular square matrix is factorised as it is. Others take the augmented system [1, A^T; A, 0], see Bjorck, Numerical methods for
+    least squares problems, 1996. Equations may be repeated; contradictory ones leave a residual for the caller to test.
     """
-    size = norm(matrix, axis=1)
-    scaling = diags(1.0 / np.where(size > 0.0, size, 1.0))
-    matrix, rhs = scaling @ matrix, scaling @ rhs
-    rows, columns = matrix.shape
-    factors = splu(bmat([[identity(columns), matrix.T], [matrix, -REPEATED * identity(rows)]], format="csc"))
-    solution, remaining = np.zeros(columns), rhs
+    matrix = csr_matrix(matrix, copy=True)
+    matrix.eliminate_zeros()
+    rhs = _unit_vectors(matrix) * rhs
+    solve = _square_solve(csc_matrix(matrix)) or _augmented_solve(matrix)
+    solution, remaining = np.zeros(matrix.shape[1]), rhs
     for _ in range(CORRECTIONS):
-        tried = solution + factors.solve(np.concatenate([np.zeros(columns), remaining]))[:columns]
+        tried = solution + solve(remaining)
         residual = rhs - matrix @ tried
         if not np.linalg.norm(residual) < 0.5 * np.linalg.norm(remaining):
             break
         solution, remaining = tried, residual
     return solution
+
+
+def _square_solve(matrix: csc_matrix) -> Callable | None:
+    """Return the solution y of A y = b as a function of b; None if the nonzero columns of A are not square or nearly singular."""
+    rows, columns = matrix.shape
+    used = np.flatnonzero(np.diff(matrix.indptr))
+    if len(used) != rows:
+        return None
+    square = csc_matrix((matrix.data, matrix.indices, matrix.indptr[np.append(used, columns)]), shape=(rows, rows))
+    scale = _unit_vectors(square)
+    try:
+        factors = splu(square)
+    except RuntimeError:  # exactly singular
+        return None
+    tried = np.random.default_rng(0).normal(size=rows)
+    if not np.linalg.norm(factors.solve(tried)) < SINGULAR * np.linalg.norm(tried):
+        return None
+
+    def solve(b: np.ndarray) -> np.ndarray:
+        result = np.zeros(columns)
+        result[used] = scale * factors.solve(b)
+        return result
+
+    return solve
+
+
+def _unit_vectors(matrix: csr_matrix | csc_matrix) -> np.ndarray:
+    """Scale the rows of a CSR, or the columns of a CSC matrix to length 1, in place; return the factors, 1 for empty ones."""
+    counts = np.diff(matrix.indptr)
+    size = np.sqrt(np.bincount(np.repeat(np.arange(len(counts)), counts), matrix.data**2, len(counts)))
+    factors = 1.0 / np.where(size > 0.0, size, 1.0)
+    matrix.data *= np.repeat(factors, counts)
+    return factors
+
+
+def _augmented_solve(matrix: csr_matrix) -> Callable:
+    """Return the least-norm solution y of A y = b as a function of b."""
+    rows, columns = matrix.shape
+    factors = splu(bmat([[identity(columns), matrix.T], [matrix, -REPEATED * identity(rows)]], format="csc"))
+    return lambda b: factors.solve(np.concatenate([np.zeros(columns), b]))[:columns]
