@@ -54,6 +54,9 @@ def sized(name: str, values: np.ndarray, *axes: str, least: float = LEAST) -> No
         axes: names of the last axes before the components, such as "rod", "node".
         least: magnitude of the largest entry; 0 for any.
     """
+    largest = max(np.max(values, initial=0.0), -np.min(values, initial=0.0))  # in two passes without memory
+    if largest == 0.0 or least <= largest <= MOST:
+        return
     size = np.abs(values, out=np.zeros(np.shape(values)), where=np.isfinite(values))
     largest = size.max(initial=0.0)
     if largest == 0.0 or least <= largest <= MOST:

@@ -38,8 +38,9 @@ def upload(values: np.ndarray, dtype, device) -> wp.array:
     if wp.get_device(device).is_cuda:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
     order = tuple(reversed(range(axes)))
-    reordered = np.ascontiguousarray(values.transpose(*order, *range(axes, values.ndim)))
-    return wp.array(reordered, dtype=dtype, device=device).transpose(order)
+    result = wp.empty(tuple(reversed(values.shape[:axes])), dtype=dtype, device=device).transpose(order)
+    result.numpy()[:] = values
+    return result
 
 
 def columns(array: wp.array, *rows: int) -> wp.array:
@@ -56,7 +57,10 @@ def columns(array: wp.array, *rows: int) -> wp.array:
 
 def assign(array: wp.array, values: np.ndarray) -> None:
     """Copy host values of the same logical shape into a device array."""
-    copy(array, upload(np.asarray(values), array.dtype, array.device))
+    if array.device.is_cpu:
+        array.numpy()[:] = values
+    else:
+        copy(array, upload(np.asarray(values), array.dtype, array.device))
 
 
 def copy(array: wp.array, source: wp.array) -> None:

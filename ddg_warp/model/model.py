@@ -326,7 +326,9 @@ class Model:
         state = self.empty_state()
         state.spun = spins is not None and bool(argument_checks.floats(spins).any())
         for group, data in zip(self.groups, state.groups, strict=True):
-            x = np.concatenate([group.host.x] * self.worlds, axis=1)
+            x = group.host.x
+            if self.worlds > 1 or points is not None:
+                x = np.concatenate([x] * self.worlds, axis=1)
             if points is not None:
                 self.order.put_nodes(group, points, x, "points")
             device_arrays.assign(data.x, x)
@@ -335,7 +337,8 @@ class Model:
                 self.order.put_nodes(group, velocities, v, "velocities")
                 device_arrays.assign(data.v, v)
             if group.kind.twist:
-                device_arrays.assign(data.frame, np.concatenate([group.host.frame] * self.worlds, axis=-1))
+                frame = group.host.frame
+                device_arrays.assign(data.frame, np.tile(frame, self.worlds) if self.worlds > 1 else frame)
                 if spins is not None:
                     omega = np.zeros((group.nodes, group.columns))
                     self.order.put_edges(group, spins, omega)

@@ -168,8 +168,8 @@ def _constant_loads(host: RodGroupData) -> tuple[np.ndarray, np.ndarray]:
 def _outer_forces(host: RodGroupData, gravity: np.ndarray, load: np.ndarray, moment: np.ndarray) -> np.ndarray:
     """Return the load scale of every rod (R,) [N]: sum of the magnitudes of external forces."""
     forces, rods = np.zeros_like(host.mass), len(host.rods)
-    for d, g in enumerate(gravity):
-        force = host.mass * g
+    for d in np.flatnonzero(gravity) if not host.loaded else range(len(gravity)):
+        force = host.mass * gravity[d]
         if host.loaded:
             force += load[..., d]
         forces += np.abs(force, out=force)
