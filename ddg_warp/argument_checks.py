@@ -31,12 +31,6 @@ def array(name: str, value, rule: str = "give numbers") -> np.ndarray:
     return result.astype(float, copy=False)
 
 
-def all_finite(values: np.ndarray) -> bool:
-    """Return True if all numbers are finite; a finite sum of them says so in one pass without a mask."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return bool(np.isfinite(values.sum()) or np.isfinite(values).all())
-
-
 def floats(value, otherwise=NAN) -> np.ndarray:
     """Return an array of real numbers, or `otherwise` for text, bools, complex numbers and the like."""
     try:

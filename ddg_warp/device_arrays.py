@@ -6,21 +6,18 @@ components are fastest and rods slowest, which keeps a rod in the cache.
 Measured: 1.35 times faster on the CPU.
 """
 
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 
 import numpy as np
 import warp as wp
 
+from ddg_warp import host_arrays
 from ddg_warp.kernels.core.launch import THREADS
 
 # Threads of a grid-stride loop, as many as a large GPU runs at once.
 #
 # Measured: with 2^20, products of pairs took a fifth longer on an H200.
 MOST = 2**18
-COMPILERS = 8  # threads that compile kernels, at most
 
 
 def allocate(shape: tuple[int, ...], dtype, device) -> wp.array:
@@ -94,15 +91,9 @@ def load_kernels(kernels, device) -> None:
     for entry in kernels:
         kernel, threads = entry if isinstance(entry, tuple) else (entry, THREADS)
         wanted[kernel.module, threads if cuda else 1] = None
-    loads = [_compilers(os.getpid()).submit(module.load, device, block_dim=threads) for module, threads in wanted]
+    loads = [host_arrays.threads().submit(module.load, device, block_dim=threads) for module, threads in wanted]
     for load in loads:
         load.result()
-
-
-@cache
-def _compilers(process: int) -> ThreadPoolExecutor:
-    """Return the threads of a process that compile kernels; they stay, since each has precompiled headers of its own."""
-    return ThreadPoolExecutor(min(os.cpu_count(), COMPILERS), "compile")
 
 
 def serial(device) -> bool:
@@ -152,6 +143,32 @@ def side_by_side(launches: list[Callable[[], None]], device) -> None:
     for stream in streams:
         main.wait_stream(stream)
     free += streams
+
+
+class Writing:
+    """Repeated host writes of a contiguous device array through one pinned buffer, filled on several cores.
+
+    Measured: checks and uploads of 50 MB take 5.3 ms with eight cores and an H100, and 11.9 ms from memory that is not pinned.
+    """
+
+    def __init__(self, array: wp.array):
+        self._array, self._host = array, array
+        if array.device.is_cuda:
+            self._host = wp.empty_like(array, device="cpu", pinned=True)
+            self._written = wp.Event(array.device)
+        self._values = self._host.numpy()
+
+    def __call__(self, values: np.ndarray) -> None:
+        """Write values that broadcast to the array, after all earlier launches."""
+        if self._host is not self._array:
+            wp.synchronize_event(self._written)
+        width = self._array.size // max(1, len(self._array))
+        for rows in host_arrays.fill(self._values, values):
+            if self._host is not self._array:
+                first, count = rows.start * width, (rows.stop - rows.start) * width
+                wp.copy(self._array, self._host, dest_offset=first, src_offset=first, count=count)
+        if self._host is not self._array:
+            self._array.device.stream.record_event(self._written)
 
 
 class Reading:

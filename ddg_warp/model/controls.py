@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ddg_warp import argument_checks
+from ddg_warp import argument_checks, host_arrays
 from ddg_warp.errors import SceneError
 
 
@@ -74,7 +74,7 @@ def _numbers(name: str, values, shape: tuple, worlds: int) -> np.ndarray:
         raise SceneError(
             f"Controls: {name} have shape {values.shape}; they are {shape}, or {(worlds, *shape)} for each of the worlds"
         )
-    if not argument_checks.all_finite(values):
+    if not host_arrays.all_finite(values):
         *world, entry = np.argwhere(~np.isfinite(values))[0][: values.ndim - len(shape) + 1]
         where = f" in world {world[0]}" if world else ""
         raise SceneError(f"Controls: {name}: entry {entry}{where} is not finite; give finite numbers")

@@ -3,6 +3,7 @@
 import numpy as np
 import warp as wp
 
+from ddg_warp import device_arrays
 from ddg_warp.compile import residual_tolerance
 from ddg_warp.kernels.forces import control_loads as kernels
 from ddg_warp.model import rod_group
@@ -28,15 +29,18 @@ class Given:
         self.moments = wp.zeros((worlds, max(1, model.order.edges_count)), dtype=real, device=device)
         self.gravity = wp.zeros(worlds, dtype=vector, device=device)
         self._filled: set[str] = set()
+        self._writings: dict[str, device_arrays.Writing] = {}
 
     def upload(self, inputs: dict[str, np.ndarray]) -> None:
         """Upload the loads of `Controls.checked`."""
         self.any = any(name in inputs for name in LOADS)
         for name in LOADS:
             array = getattr(self, name)
-            if name in inputs:
+            if name in inputs and inputs[name].size:
                 values = inputs[name] - self._usual if name == "gravity" else inputs[name]
-                array.assign(np.ascontiguousarray(np.broadcast_to(values, (len(array), *values.shape[1:]))))
+                if name not in self._writings:
+                    self._writings[name] = device_arrays.Writing(array)
+                self._writings[name](values)
                 self._filled.add(name)
             elif name in self._filled:
                 array.zero_()
