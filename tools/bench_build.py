@@ -1,7 +1,7 @@
 """Time what comes before the first step: scenes, models, rest shapes, states, controls and kernels.
 
     python tools/bench_build.py [--quick] [--only WHAT ...] [--json FILE]   seconds of this version
-    python tools/bench_build.py --against FILE [--out DIR]                  with those of another version: a table
+    python tools/bench_build.py --rows FILE --against FILE [--out DIR]      a table of them and those of another version
 
 `pile`: the scene `rod_pile` and its model. `sag_free`: rest strains of strands of 32 nodes. `rods`: scene and model of rods of 64
 nodes. `state`, `points`: their rest state, and its points. `controls`: a step with forces, poses and gravity of every world, less a
@@ -126,30 +126,44 @@ def cold(count: int):
 CASES = {"pile": pile, "sag_free": rest_strains, "rods": rods, "controls": controls, "cold": cold}
 
 
-def main() -> None:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="smallest sizes")
-    parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES), help="cases (default: all)")
-    parser.add_argument("--json", type=Path, help="file for the rows")
-    parser.add_argument("--against", type=Path, help="rows of another version")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results", help="default: tools/results")
-    options = parser.parse_args()
-    warnings.simplefilter("ignore")
-    wp.config.quiet = True
+def measured(options) -> dict:
+    """Return the rows of this version, with their command and machine."""
     sizes, rows, speed = QUICK if options.quick else SIZES, [], bandwidth()
     for name in options.only:
         for what, size, seconds, wall in CASES[name](sizes[name]):
             floor = size / speed if size else ""
             rows.append({"what": what, "size": sizes[name], "seconds": seconds, "wall": wall, "floor": floor})
             print(table(rows[-1:]).splitlines()[1], file=sys.stderr, flush=True)
-    origin = {"command": " ".join(["python", "tools/bench_build.py", *sys.argv[1:]]), "machine": machine()}
+    command = " ".join(["python", "tools/bench_build.py", *sys.argv[1:]])
+    return {"command": command, "machine": machine(), "rows": rows}
+
+
+def main() -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="smallest sizes")
+    parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES), help="cases (default: all)")
+    parser.add_argument("--json", type=Path, help="file for the rows")
+    parser.add_argument("--rows", type=Path, help="rows of this version, which are measured otherwise")
+    parser.add_argument("--against", type=Path, help="rows of another version")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results", help="default: tools/results")
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    wp.config.quiet = True
+    result = json.loads(options.rows.read_text()) if options.rows else measured(options)
     if options.json:
-        write_json(options.json, {**origin, "rows": rows})
+        write_json(options.json, result)
+    rows = result["rows"]
     if options.against:
         other = json.loads(options.against.read_text())
         before = {row["what"]: row for row in other["rows"]}
-        rows = [{**row, "seconds before": before[row["what"]]["seconds"]} for row in rows]
+        rows = [
+            {"what": row["what"], "size": row["size"]}
+            | {f"{name}_before": before[row["what"]][name] for name in ("seconds", "wall")}
+            | {name: row[name] for name in ("seconds", "wall", "floor")}
+            for row in rows
+        ]
+        origin = {name: result[name] for name in ("command", "machine")}
         write_table(options.out / "build_cpu", rows, {**origin, "before": other["machine"]["commit"]})
     print(table(rows))
 
