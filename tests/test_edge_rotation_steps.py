@@ -136,15 +136,13 @@ def test_midpoint_rule_is_stiff_by_half_the_step(device):
     ("options", "psd"),
     [
         ({"linear": "partitioned"}, "progressive"),
-        ({"linear": "chain"}, "progressive"),
-        ({"linear": "block_jacobi"}, "gauss_newton"),
         ({"solver": "projective"}, "gauss_newton"),
         ({"psd": "gauss_newton"}, "gauss_newton"),
         ({"psd": "none"}, "none"),
     ],
 )
 def test_matrix_of_stiff_rods_by_options(device, options, psd):
-    """Options that cannot detect indefinite matrices, freeze them or exclude them use none; all results agree."""
+    """Frozen and Gauss-Newton matrices have no second derivatives; all results agree."""
     scene = cantilever(32, ddg.Circle(2e-3), ddg.Material(young=5e8, poisson=0.5, density=1000.0))
     expected, usual = advance(scene, device, T60, 5, rtol=1e-9)
     assert matrix_and_stiffness(usual) == [("progressive", True)]

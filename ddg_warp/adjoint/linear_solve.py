@@ -10,7 +10,6 @@ from scipy.sparse.linalg import splu
 from ddg_warp import device_arrays
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.adjoint import float32_error, iterative_refinement
-from ddg_warp.kernels.adjoint.coupled_linear_solve import check_kernels
 from ddg_warp.solve.equilibrium.rigid_modes import rigid_modes
 from ddg_warp.solve.equilibrium.rod_tangent import RodTangent
 from ddg_warp.solve.linear.cyclic_reduction import CyclicReduction, Elimination
@@ -18,12 +17,9 @@ from ddg_warp.solve.linear.solver_selection import automatic
 from ddg_warp.solve.linear.sparse_direct import SingularError, regular
 from ddg_warp.solve.newton.rod_newton import NewtonOptions, RodNewton
 from ddg_warp.solve.newton.rod_newton_assembled import AssembledNewton
-from ddg_warp.solve.newton.rod_newton_pcg import PcgNewton
 
 CLOSE = 1e-5  # accepted relative error of w from refined float32 solutions; roll-outs amplify it ...
 PASSES = 2  # ... which limits refinement. Measured: with 3 passes, an error of 1e-2 each, gradients erred by 1e-3
-LINEAR_RTOL = 1e-13  # of conjugate gradients of closed rods, in the norm of their preconditioner.
-MISSED = 1e-6  # Largest true relative residual left by conjugate gradients, for rounding.
 SINGULAR = 1e-6  # Accepted relative residual; a singular matrix that was regularised leaves more
 
 
@@ -155,36 +151,11 @@ def _transposed(matrix: sparse.csc_matrix):
     return lambda rhs: factors.solve(rhs, trans="T")
 
 
-class ClosedRodSolve:
-    """Solver of closed rods by conjugate gradients, preconditioned by the opened rods; interface of `CyclicReduction`."""
-
-    def __init__(self, system: PcgNewton):
-        self.system = system
-        _, self._check = check_kernels(system.linear)
-
-    @property
-    def kernels(self) -> list:
-        """Kernels to load before a capture."""
-        system = self.system
-        return [system._factor, system._start, system._product, system._advance, self._check]
-
-    def solve(self, matrix, rhs, count, wanted, solution: wp.array, failed: wp.array, again: bool = False) -> None:
-        """Solve as `CyclicReduction.solve`; `failed` marks rods with a residual left."""
-        system = self.system
-        wp.copy(system.islands.needs_direction, wanted)
-        system.factorise()
-        system.rhs, system.direction = rhs, solution
-        system.direct()
-        failed.zero_()
-        read = [system.rho, system.rho_first, MISSED]
-        wp.launch(self._check, system.group.columns, read, [failed], device=system.device)
-
-
 class DirectSolve:
     """Device solver of H w = g of a rod group.
 
-    Factors come from the sweep, or, in another precision than the state's, from block elimination or cyclic reduction with
-    iterative refinement. Closed rods are solved by conjugate gradients.
+    Factors come from the sweep or, of closed rods or in another precision than the state's, from block elimination or cyclic
+    reduction, in another precision with iterative refinement.
 
     Args:
         linear: precision of the factors; by default that of the state.
@@ -199,13 +170,8 @@ class DirectSolve:
         kind, device, real = group.kind, model.wp_device, model.types.real
         arguments, size = (model, group, NewtonOptions(psd="none"), real), (group.nodes, group.columns)
         self._wanted = wp.full(group.columns, 1, dtype=int, device=device)
-        if kind.closed:
-            options = NewtonOptions(psd="none", linear_rtol=LINEAR_RTOL)
-            self.system = PcgNewton(model, group, options, linear=real)
-            self.solver, self.failed = ClosedRodSolve(self.system), self.system.islands.lost_pivots
-            return
         few = automatic(group) == "partitioned"
-        if not few and linear is None:
+        if not few and not kind.closed and linear is None:
             self.solver, self.system = None, RodNewton(*arguments)
             self._moved = self.system.x, self.system.theta  # arrays that the sweep moves along w
             self.failed = self.system.islands.status

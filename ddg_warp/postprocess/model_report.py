@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ddg_warp.kernels.linear import cyclic_reduction
+from ddg_warp.kernels.linear import cyclic_reduction, rod_elimination
 from ddg_warp.kernels.terms import ALL, FRICTION, Potential, contact_potential
 from ddg_warp.scene.material import DRAWN
 from ddg_warp.scene.obstacles import BALL, MESH, PLANE
@@ -13,14 +13,13 @@ from ddg_warp.solve.linear.rod_substructuring import RodSubstructuring
 from ddg_warp.solve.linear.solver_selection import automatic, coupled_preconditioner
 from ddg_warp.solve.linear.sparse_system import SparseSystem
 from ddg_warp.solve.stepping.decoupled_step import uncoupled
-from ddg_warp.solve.stepping.rod_step import DIRECT
 from ddg_warp.solve.stepping.step_driver import LinearSolverChoice, choose_solver
 
 SOLVERS = {
-    "chain": "PCG (closed rods)",
     "sweep": "block LDL^T sweep, one Newton loop a rod",
     "partitioned": "cyclic reduction (few long rods), one Newton loop a rod",
 }
+CLOSED = "block LDL^T with a Schur complement (closed rods), one Newton loop a rod"
 
 
 def report(model) -> str:
@@ -41,7 +40,8 @@ def report(model) -> str:
             lines.append(f"  {term.name}: {elements} elements, {term.measure.name} x {term.density.name}")
         if kind.drag:
             lines.append("  drag, implicit")
-        lines.append(f"  solver: {SOLVERS[automatic(group)]}, linear algebra in {model.types.linear.__name__}")
+        solver = CLOSED if kind.closed else SOLVERS[automatic(group)]
+        lines.append(f"  solver: {solver}, linear algebra in {model.types.linear.__name__}")
         lines += step_lines(model, lambda s, group=group: (group.float32_errors(s), _split_errors(group, s)))
         lines.append(f"  memory: {bytes_per_node(model, group)} bytes a node")
     if model.coupled is not None:
@@ -63,7 +63,7 @@ def report(model) -> str:
 
 
 def _split_errors(group, s: float) -> np.ndarray:
-    return group.split_errors(s) if automatic(group) in DIRECT else np.array([np.inf])
+    return np.array([np.inf]) if group.kind.closed else group.split_errors(s)
 
 
 def step_lines(model, errors_of: Callable) -> list[str]:
@@ -153,6 +153,8 @@ def bytes_per_node(model, group) -> int:
     iterate = 2 * kind.dim + (9 if kind.twist else 0) + kind.window + 2
     solver = kind.factor_rows + 2 * nb**2 + 2 * nb + 1
     constant = 2 * real + 1
+    if kind.closed:
+        solver += nb**2 + rod_elimination.kept_rows(kind)
     if automatic(group) == "partitioned":
         iterate += kind.dim + (7 if kind.twist else 0) + 2
         solver += 3 * nb**2 + nb + sum(cyclic_reduction.level_rows(nb)) // 2

@@ -9,7 +9,7 @@ nodes see `kernels.core.nodes`.
 Alternative: one source for the solvers around elements. It is separate where the algorithms differ. Residuals have other stopping
 rules: sums over a whole rod, or over hierarchical clusters. The line search of rods is fused with their sweep, one thread a rod and
 one launch an iteration. Rods update the frames of two edges a vertex in one kernel, the coupled system edge by edge. Matrix blocks
-and eliminations cover a rod, or bands and slices with joints. Conjugate gradients of rods serve closed ones alone.
+and eliminations cover a rod, or bands and slices with joints.
 """
 
 from collections.abc import Callable

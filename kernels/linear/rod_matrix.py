@@ -1,4 +1,4 @@
-"""Block-banded system of a rod, open or closed: assembly, product and block LDL^T.
+"""Block-banded system of a rod, open or closed: assembly, and block LDL^T of open rods.
 
 Node k has the blocks D_k, E_k (coupling to node k + 1) and F_k (to node k + 2; modulo the nodes of a closed rod), in one array of 3
 nb^2 rows: [component][node][rod]. One thread gathers a block, so that sums have a fixed order, without atomics. Rows and columns of
@@ -219,34 +219,6 @@ def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None, 
 
 
 @cache
-def product_function(kind: RodKind, linear):
-    """Return the device function `times(blocks, v, k, n, r)`: row k of H v."""
-    nb2, span, closed = kind.block**2, kind.span, kind.closed
-    load, _, vector, _ = block_functions(kind.block, linear)
-    _, previous, *_ = node_functions(kind, wp.float64)
-    along, *_ = gather_functions(kind, wp.float64)
-
-    @wp.func
-    def times(blocks: wp.array3d(dtype=linear), v: wp.array3d(dtype=linear), k: int, n: int, r: int):
-        y = load(blocks, 0, k, r) * vector(v, 0, k, r)
-        if wp.static(closed) or k < n - 1:
-            y += load(blocks, wp.static(nb2), k, r) * vector(v, 0, along(k + 1, n), r)
-        b = previous(k, n)
-        if b >= 0:
-            y += vector(v, 0, b, r) * load(blocks, wp.static(nb2), b, r)
-        if wp.static(span == 2):
-            if wp.static(closed) or k < n - 2:
-                y += load(blocks, wp.static(2 * nb2), k, r) * vector(v, 0, along(k + 2, n), r)
-            if b >= 0:
-                bb = previous(b, n)
-                if bb >= 0:
-                    y += vector(v, 0, bb, r) * load(blocks, wp.static(2 * nb2), bb, r)
-        return y
-
-    return times
-
-
-@cache
 def factor_function(nb: int, span: int, linear, tensions: int = 0):
     """Return the device function `factorise(blocks, out, n, r) -> lost pivots`: block LDL^T of an open rod of n nodes.
 
@@ -306,36 +278,10 @@ def factor_function(nb: int, span: int, linear, tensions: int = 0):
 
 
 @cache
-def factor_kernel(kind: RodKind, linear):
-    """Build the kernel of factorisation.
+def substitute_function(nb: int, span: int, linear, tensions: int = 0):
+    """Return the device function `substitute(factor, v, out, n, r, s)`: out = (L D L^T)^-1 v along an open rod.
 
-    `factorise`: write the block LDL^T of H without its periodic blocks; see `factor_function`.
-    """
-    factor = factor_function(kind.block, kind.span, linear)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def factorise(
-        blocks: wp.array3d(dtype=linear),
-        count: wp.array(dtype=int),
-        wanted: wp.array(dtype=int),
-        iteration: wp.array(dtype=int),
-        reuse: int,
-        factor_out: wp.array3d(dtype=linear),
-        lost: wp.array(dtype=int),
-    ):
-        r = wp.tid()
-        if wanted[r] == 0 or (reuse != 0 and iteration[r] > 1):
-            return
-        lost[r] = lost[r] + factor(blocks, factor_out, count[r], r)
-
-    return factorise
-
-
-@cache
-def substitute_function(nb: int, span: int, linear, dotted: bool = False, tensions: int = 0):
-    """Return the device function `substitute(factor, v, out, n, r, s)`: out = (L D L^T)^-1 v along a rod.
-
-    It returns v . out if `dotted`. Factors are in column r, vectors in column s.
+    Factors are in column r, vectors in column s.
     """
     nb2 = nb**2
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
@@ -377,7 +323,6 @@ def substitute_function(nb: int, span: int, linear, dotted: bool = False, tensio
             value = value_ahead
         e1 = H()
         e2 = H()
-        total = linear(0.0)
         L = load(factor, wp.static(2 * nb2), n - 1, r)
         inverse = vector(factor, wp.static(3 * nb2), n - 1, r)
         value = vector(out, 0, n - 1, s)
@@ -395,8 +340,6 @@ def substitute_function(nb: int, span: int, linear, dotted: bool = False, tensio
             u -= U * e1
             if wp.static(span == 2):
                 u -= V * e2
-            if wp.static(dotted):
-                total += wp.dot(vector(v, 0, j, s), u)
             store_vector(out, 0, j, s, u)
             e2 = e1
             e1 = u
@@ -405,7 +348,6 @@ def substitute_function(nb: int, span: int, linear, dotted: bool = False, tensio
             L = L_ahead
             inverse = inverse_ahead
             value = value_ahead
-        return total
 
     return substitute
 
@@ -459,26 +401,3 @@ def substitute_all_function(nb: int, span: int, linear, sides: int):
             e1 = u
 
     return substitute
-
-
-@cache
-def direct_kernel(kind: RodKind, linear):
-    """Build the kernel of the direct solve.
-
-    `direct`: compute the search direction of every wanted rod from the factors.
-    """
-    substitute = substitute_function(kind.block, kind.span, linear)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def direct(
-        factor: wp.array3d(dtype=linear),
-        rhs: wp.array3d(dtype=linear),
-        count: wp.array(dtype=int),
-        wanted: wp.array(dtype=int),
-        solution: wp.array3d(dtype=linear),
-    ):
-        r = wp.tid()
-        if wanted[r] != 0:
-            _total = substitute(factor, rhs, solution, count[r], r, r)
-
-    return direct

@@ -81,7 +81,7 @@ def serial_path_nodes_kernel(twist: bool, span: int, linear, split: bool = False
             store_vector(
                 values, 0, k, r, rhs(residual, places[0, k, c], angle_of(places, k, c), fixed_dofs[k, c], first)
             )
-        _product = substitute(factors, values, values, n, r, r)
+        substitute(factors, values, values, n, r, r)
         for k in range(n):
             b = value(residual, places, k, c, first)
             hand(vector(values, 0, k, r), b, places[0, k, c], angle_of(places, k, c), w, first, z, dots_out)
@@ -195,7 +195,7 @@ def path_kernels(twist: bool, span: int, linear, sides: int, serial: bool, split
         r = s - s / columns * columns
         w = r / count.shape[0]
         if wanted[w] == 1 and idle[r] == 0:
-            _product = substitute(factors, values, values, count[r - w * count.shape[0]], r, s)
+            substitute(factors, values, values, count[r - w * count.shape[0]], r, s)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def spread(wanted: wp.array(dtype=int), idle: wp.array(dtype=int), columns: int, wanted_out: wp.array(dtype=int)):

@@ -13,9 +13,12 @@ from ddg_warp.kernels.core.islands import (
     BELOW_ROUNDING_FLOOR,
     CCD_LIMITED,
     DOUBTFUL,
+    DROP_COMPRESSION,
+    ENERGY_BUFFER,
     ITERATE_ACTION,
     ITERATION,
     LOAD_SCALE,
+    LOST_PIVOTS_TOTAL,
     NEEDS_DIRECTION,
     NOT_CONVERGED,
     PREDICTED_DECREASE,
@@ -24,6 +27,7 @@ from ddg_warp.kernels.core.islands import (
     STEP_LENGTH,
     STRAIGHT_ROTATION_LIMIT,
     SUPPORT_MOTION_PENDING,
+    projected_limit_function,
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, items_function, until_function
 from ddg_warp.kernels.newton.line_search import NEED_DIRECTION, STOP, line_search_functions
@@ -321,3 +325,42 @@ def static_kernels(real, linear):
             wanted[w] = 3
 
     return follow, less, far
+
+
+@cache
+def repeat_kernel(real, fails: bool, exact: bool = True):
+    """Build the kernel that handles an indefinite exact Hessian.
+
+    `repeat`: end the solve (if it `fails`), or undo the acceptance and repeat the iterate.
+
+    `negative` counts lost pivots and negative curvatures of this iteration. `drop_compression` then drops the geometric stiffness and
+    compression from the next matrix, and the line search accepts again on the same numbers. `done`: the direction has been computed.
+    `exact`: the matrix is the exact Hessian unless that is indefinite.
+    """
+
+    out_of_patience = projected_limit_function(real)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
+    def repeat(done: int, flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), negative: wp.array(dtype=int)):
+        r = wp.tid()
+        if flags[NEEDS_DIRECTION, r] == 0:
+            return
+        if negative[r] > 0 and flags[DROP_COMPRESSION, r] == 0:
+            flags[NEEDS_DIRECTION, r] = 0
+            negative[r] = 0
+            if wp.static(fails):
+                flags[STATUS, r] = wp.static(outcome.INDEFINITE)
+                return
+            flags[DROP_COMPRESSION, r] = 1
+            flags[ITERATION, r] = flags[ITERATION, r] - 1
+            flags[ENERGY_BUFFER, r] = 1 - flags[ENERGY_BUFFER, r]
+        elif done != 0:
+            flags[LOST_PIVOTS_TOTAL, r] = flags[LOST_PIVOTS_TOTAL, r] + negative[r]
+            negative[r] = 0
+            if wp.static(exact):
+                if out_of_patience(flags, scalars, r):
+                    flags[NEEDS_DIRECTION, r] = 0
+            else:
+                flags[DROP_COMPRESSION, r] = 0
+
+    return repeat

@@ -1,4 +1,4 @@
-"""Armijo line search and convergence test of a rod, from sums over its nodes.
+"""Armijo line search and convergence test of a rod, from sums over its nodes; of assembled rods also the sums, in a fixed order.
 
 A rod stops where it has converged. Otherwise its iterate is accepted, or the step is shortened, by Armijo's rule (c = 1e-4) on the
 energy. If the predicted decrease is below the rounding floor, a residual that has not grown much is accepted.
@@ -15,15 +15,20 @@ import warp as wp
 
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.islands import (
+    ANGLE_STEP_LEFT,
     ANY_ACTIVE,
     BACKTRACKS,
     BELOW_ROUNDING_FLOOR,
     DOUBTED,
     DOUBTFUL,
+    DROP_COMPRESSION,
     ENERGY_BUFFER,
     FRAMES_OUTDATED,
+    ITERATE_ACTION,
     ITERATION,
     LOAD_SCALE,
+    LOST_PIVOTS,
+    LOST_PIVOTS_TOTAL,
     MAX_RESIDUAL,
     NEEDS_DIRECTION,
     NOT_CONVERGED,
@@ -32,11 +37,13 @@ from ddg_warp.kernels.core.islands import (
     RESIDUAL_NORM_SQ,
     STATUS,
     STEP_LENGTH,
+    STRAIGHT_ROTATION_LIMIT,
     SUPPORT_MOTION_PENDING,
+    projected_limit_function,
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements.rod_layout import RodKind
-from ddg_warp.kernels.newton.rod_iterate import ROTATE_EDGES, UPDATE_FRAMES, search_functions, shorter_function
+from ddg_warp.kernels.newton.rod_iterate import MOVE_STRAIGHT, ROTATE_EDGES, UPDATE_FRAMES, shorter_function
 
 STOP, NEED_DIRECTION = 0, 3  # actions in addition to `ROTATE_EDGES` and `UPDATE_FRAMES`: none, and compute a direction
 ROUNDED, SETTLED, POLISHES = 1e-4, 1e-5, 10
@@ -165,66 +172,173 @@ def line_search_functions(twist: bool, real, driven: bool = False):
 
 
 @cache
-def line_search_kernel(kind: RodKind, real, linear):
-    """Build the kernel of the line search.
+def sum_kernels(kind: RodKind, real, linear):
+    """Build the kernels of partial sums over ranges of nodes.
 
-    `judge`: sum over a rod's nodes, decide, and write a shortened step or updated frames, one thread a rod.
+    `weigh`: sum energy changes, rounding and residuals.
+    `gauge`: sum r . d and find the largest rotation of a direction.
+
+    Range i of a rod has its nodes i, i + ranges, ..., so that neighbouring threads read neighbouring nodes.
     """
-    V = wp.types.vector(kind.dim, real)
-    place, turn_angles, relag, _ = search_functions(kind, real, linear)
-    balanced, decide = line_search_functions(kind.twist, real)
-    twist, nb = kind.twist, kind.block
+    dim, nb = kind.dim, kind.block
+    V = wp.types.vector(dim, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def judge(
+    def weigh(
         residual: wp.array3d(dtype=linear),
         change: wp.array2d(dtype=real),
         noise: wp.array2d(dtype=linear),
         count: wp.array(dtype=int),
-        floor: real,
-        max_iterations: int,
-        max_halvings: int,
-        direction: wp.array3d(dtype=linear),
-        fixed: wp.array2d(dtype=wp.uint8),
-        anchor: wp.array(dtype=int),
-        base: wp.array2d(dtype=V),
-        x: wp.array2d(dtype=V),
-        theta: wp.array2d(dtype=real),
-        frame: wp.array3d(dtype=real),
-        flags: wp.array2d(dtype=int),
-        scalars: wp.array2d(dtype=real),
+        status: wp.array(dtype=int),
+        ranges: int,
+        partial_out: wp.array3d(dtype=real),
     ):
-        r = wp.tid()
-        flags[NEEDS_DIRECTION, r] = 0
-        if balanced(flags, scalars, r):
+        """Sum energy changes, their rounding and squared residuals; find the largest residual component."""
+        i, r = wp.tid()
+        if status[r] != 0:
             return
-        n = count[r]
         total = real(0.0)
         rounding = real(0.0)
         square = real(0.0)
         worst = real(0.0)
-        for k in range(n):
+        for k in range(i, count[r], ranges):
             total += change[k, r]
             rounding += real(noise[k, r])
             for d in range(wp.static(nb)):
                 size = wp.abs(real(residual[d, k, r]))
                 worst = wp.max(worst, size)
                 square += size * size
+        partial_out[0, i, r] = total
+        partial_out[1, i, r] = rounding
+        partial_out[2, i, r] = square
+        partial_out[3, i, r] = worst
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def gauge(
+        residual: wp.array3d(dtype=linear),
+        direction: wp.array3d(dtype=linear),
+        x: wp.array2d(dtype=V),
+        count: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        ranges: int,
+        base_out: wp.array2d(dtype=V),
+        partial_out: wp.array3d(dtype=real),
+    ):
+        """Write partial sums of r . d and the largest squared edge rotation; store the iterate as base of the step."""
+        i, r = wp.tid()
+        if wanted[r] == 0:
+            return
+        total = real(0.0)
+        rotation = real(0.0)
+        for k in range(i, count[r], ranges):
+            x_k = x[k, r]
+            base_out[k, r] = x_k
+            for d in range(wp.static(nb)):
+                total += real(residual[d, k, r]) * real(direction[d, k, r])
+            if k > 0:
+                bent = V()
+                for d in range(wp.static(dim)):
+                    bent[d] = real(direction[d, k, r] - direction[d, k - 1, r])
+                rotation = wp.max(rotation, wp.length_sq(bent) / wp.length_sq(x_k - x[k - 1, r]))
+        partial_out[0, i, r] = total
+        partial_out[1, i, r] = rotation
+
+    return weigh, gauge
+
+
+@cache
+def decide_kernels(kind: RodKind, real, exact: bool, fails: bool = False):
+    """Build the kernels of decisions from partial sums.
+
+    `judge`: test the iterate of a rod.
+    `take`: set the step length along a direction.
+
+    A lost pivot ends the solve if it `fails`. Otherwise the iterate is repeated without geometric stiffness and compression.
+    `exact`: the matrix is the exact Hessian unless that is indefinite.
+    """
+    balanced, decide = line_search_functions(kind.twist, real)
+    out_of_patience = projected_limit_function(real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def judge(
+        partial: wp.array3d(dtype=real),
+        ranges: int,
+        floor: real,
+        max_iterations: int,
+        max_halvings: int,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+    ):
+        r = wp.tid()
+        flags[NEEDS_DIRECTION, r] = 0
+        flags[ITERATE_ACTION, r] = 0
+        flags[LOST_PIVOTS, r] = 0
+        if balanced(flags, scalars, r):
+            return
+        total = real(0.0)
+        rounding = real(0.0)
+        square = real(0.0)
+        worst = real(0.0)
+        for i in range(ranges):
+            total += partial[0, i, r]
+            rounding += partial[1, i, r]
+            square += partial[2, i, r]
+            worst = wp.max(worst, partial[3, i, r])
+        if flags[ITERATION, r] == 0:
+            flags[LOST_PIVOTS_TOTAL, r] = 0
         taken = scalars[STEP_LENGTH, r]
         action = decide(total, rounding * floor, square, worst, max_iterations, max_halvings, flags, scalars, r)
         if action == wp.static(STOP):
             return
         flags[ANY_ACTIVE, 0] = 1
-        if action == wp.static(ROTATE_EDGES):
-            shortened = scalars[STEP_LENGTH, r]
-            place(x, base, base, direction, fixed, anchor, shortened, 0, n, r)
-            turn_angles(theta, direction, shortened - taken, n, r)
-        if wp.static(twist):
-            if action == wp.static(UPDATE_FRAMES):
-                relag(x, frame, n, r)
-                for k in range(n):
-                    base[k, r] = x[k, r]
         if action == wp.static(NEED_DIRECTION):
             flags[NEEDS_DIRECTION, r] = 1
+        else:
+            flags[ITERATE_ACTION, r] = action
+            scalars[ANGLE_STEP_LEFT, r] = scalars[STEP_LENGTH, r] - taken
 
-    return judge
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def take(
+        partial: wp.array3d(dtype=real),
+        ranges: int,
+        rotation_cap: real,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+    ):
+        r = wp.tid()
+        if flags[NEEDS_DIRECTION, r] == 0:
+            return
+        if flags[LOST_PIVOTS, r] > 0 and flags[DROP_COMPRESSION, r] == 0:
+            if wp.static(fails):
+                flags[STATUS, r] = wp.static(outcome.INDEFINITE)
+                return
+            # The matrix is indefinite: repeat the iterate with compression dropped.
+            flags[DROP_COMPRESSION, r] = 1
+            flags[ITERATION, r] = flags[ITERATION, r] - 1
+            scalars[STEP_LENGTH, r] = real(0.0)
+            return
+        if wp.static(exact):
+            if out_of_patience(flags, scalars, r):
+                return
+        flags[LOST_PIVOTS_TOTAL, r] = flags[LOST_PIVOTS_TOTAL, r] + flags[LOST_PIVOTS, r]
+        total = real(0.0)
+        rotation = real(0.0)
+        for i in range(ranges):
+            total += partial[0, i, r]
+            rotation = wp.max(rotation, partial[1, i, r])
+        if not wp.isfinite(total):
+            flags[STATUS, r] = wp.static(outcome.NON_FINITE)
+            return
+        whole = real(1.0)
+        if rotation > rotation_cap * rotation_cap:
+            whole = rotation_cap / wp.sqrt(rotation)
+        scalars[STEP_LENGTH, r] = whole
+        scalars[ANGLE_STEP_LEFT, r] = whole
+        scalars[PREDICTED_DECREASE, r] = total
+        flags[ITERATE_ACTION, r] = wp.where(
+            rotation > scalars[STRAIGHT_ROTATION_LIMIT, r] * scalars[STRAIGHT_ROTATION_LIMIT, r],
+            wp.static(ROTATE_EDGES),
+            wp.static(MOVE_STRAIGHT),
+        )
+
+    return judge, take

@@ -222,14 +222,18 @@ def search_functions(kind: RodKind, real, linear, split: bool = False):
 
 
 @cache
-def adjust_kernel(kind: RodKind, real, linear, split: bool = False):
-    """Build the kernel that completes a sweep for few rods.
+def adjust_kernel(kind: RodKind, real, linear, split: bool = False, assembled: bool = False):
+    """Build the kernel that completes an iteration.
 
     `adjust`: write a shortened or far-rotating step, or update the frames of its iterate.
+
+    `assembled`: the iteration is of `AssembledNewton`, which keeps `base` and leaves straight updates to this kernel. The sweep takes
+    them itself.
     """
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
     place, turn_angles, relag, _ = search_functions(kind, real, linear, split)
+    step_of, *_ = move_functions(kind, real, linear, split)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def adjust(
@@ -260,6 +264,14 @@ def adjust_kernel(kind: RodKind, real, linear, split: bool = False):
         if wp.static(twist):
             if flags[ITERATE_ACTION, r] == wp.static(UPDATE_FRAMES):
                 relag(x, frame, count[r], r)
+                if wp.static(assembled):
+                    for j in range(count[r]):
+                        base[j, r] = x[j, r]
+        if wp.static(assembled):
+            if flags[ITERATE_ACTION, r] == wp.static(MOVE_STRAIGHT):
+                for j in range(count[r]):
+                    x[j, r] = base[j, r] + step_of(direction, j, r) * scalars[STEP_LENGTH, r]
+                turn_angles(theta, direction, scalars[ANGLE_STEP_LEFT, r], count[r], r)
         flags[ITERATE_ACTION, r] = 0
 
     return adjust

@@ -3,7 +3,7 @@
 import warp as wp
 
 from ddg_warp import device_arrays
-from ddg_warp.kernels.linear import cyclic_reduction, cyclic_reduction_solve, mixed_pairs, rod_matrix
+from ddg_warp.kernels.linear import cyclic_reduction, cyclic_reduction_solve, mixed_pairs, rod_elimination
 from ddg_warp.solve.linear.solver_selection import LONGEST_REPEATED
 
 REDUCING = 128  # Threads of a block in a reduction level.
@@ -154,17 +154,19 @@ class CyclicReduction:
 
 
 class Elimination:
-    """Block LDL^T sweep with one thread a rod, for many rods; interface of `CyclicReduction`.
+    """Block LDL^T of open or closed rods with one thread a rod, for many rods; interface of `CyclicReduction`.
 
     Args:
         kind: `RodKind` of the rods; columns: number of rods in all worlds.
+        iteration: iteration of every column, if factors of the first one are reused; else None.
     """
 
-    def __init__(self, kind, nodes: int, columns: int, linear, device):
+    def __init__(self, kind, nodes: int, columns: int, linear, device, iteration: wp.array | None = None):
         self.columns, self.device = columns, device
-        self._factors = device_arrays.allocate((3 * kind.block**2 + kind.block, nodes, columns), linear, device)
-        self._first = wp.zeros(columns, dtype=int, device=device)  # first iteration of every column
-        self._factor, self._direct = rod_matrix.factor_kernel(kind, linear), rod_matrix.direct_kernel(kind, linear)
+        self._factors = device_arrays.allocate((rod_elimination.kept_rows(kind), nodes, columns), linear, device)
+        self._reuse = iteration is not None
+        self._iteration = iteration if self._reuse else wp.zeros(columns, dtype=int, device=device)
+        self._factor, self._direct = rod_elimination.elimination_kernels(kind, linear)
 
     @property
     def kernels(self) -> list:
@@ -174,7 +176,9 @@ class Elimination:
     def solve(self, matrix, rhs, count, wanted, solution: wp.array, lost: wp.array, again: bool = False) -> None:
         """Solve the wanted columns; see `CyclicReduction.solve`."""
         if not again:
-            self._launch(self._factor, [matrix, count, wanted, self._first, 0], [self._factors, lost])
+            self._launch(
+                self._factor, [matrix, count, wanted, self._iteration, int(self._reuse)], [self._factors, lost]
+            )
         self._launch(self._direct, [self._factors, rhs, count, wanted], [solution])
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:

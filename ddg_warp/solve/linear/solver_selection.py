@@ -35,10 +35,9 @@ LAUNCHES = 1
 
 
 def automatic(group) -> str:
-    """Return the linear solver of a rod group: `"chain"` if closed, `"partitioned"` if few and long on CUDA, or `"sweep"`."""
-    if group.kind.closed:
-        return "chain"
-    return "partitioned" if long_and_few(group.nodes, group.columns, group.device) else "sweep"
+    """Return the linear solver of a rod group: `"partitioned"` for few, long, open rods on CUDA, or `"sweep"`."""
+    few = not group.kind.closed and long_and_few(group.nodes, group.columns, group.device)
+    return "partitioned" if few else "sweep"
 
 
 def long_and_few(nodes: int, columns: int, device, repeated: bool = False) -> bool:

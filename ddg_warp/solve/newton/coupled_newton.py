@@ -12,7 +12,7 @@ import warp as wp
 from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core.islands import Islands
-from ddg_warp.kernels.linear import rod_pcg
+from ddg_warp.kernels.newton import coupled_newton
 from ddg_warp.solve.linear.linear_system import LinearSystem
 from ddg_warp.solve.linear.pcg import NewtonPCG, natural_scale
 from ddg_warp.solve.linear.rod_substructuring import RodSubstructuring
@@ -110,7 +110,7 @@ class CoupledNewton:
             self.contact and self.contact.bends
         )
         repeats = not reuse and (fails or curved or self.exact)
-        self._repeat = rod_pcg.repeat_kernel(real, fails, curved) if repeats else None
+        self._repeat = coupled_newton.repeat_kernel(real, fails, curved) if repeats else None
         # flags of indefiniteness: repeat the iterate, or drop compression in the next one
         self.system = LinearSystem.of(
             coupled,

@@ -266,6 +266,10 @@ class RodNewton:
     def sweep(self) -> None:
         """Factorise, decide, and take the next step."""
         self.eliminate()
+        self.adjust()
+
+    def adjust(self) -> None:
+        """Complete an iteration: shorten or rotate steps, and update frames."""
         group = self.group
         with timer("edge rotation"):
             wp.launch(

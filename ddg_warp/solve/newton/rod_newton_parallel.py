@@ -6,8 +6,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import device_arrays
-from ddg_warp.errors import SceneError
-from ddg_warp.kernels.newton import line_search_parallel, rod_iterate_parallel
+from ddg_warp.kernels.newton import rod_iterate_parallel
 from ddg_warp.kernels.newton.edge_rotation import EXTRAPOLATE_ROTATED, REPEAT_ROTATION
 from ddg_warp.solve.linear.cyclic_reduction import CyclicReduction, TensionReduction
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
@@ -22,15 +21,11 @@ class RodNewtonParallel(AssembledNewton):
     """
 
     def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False, split: bool = False):
-        if options.psd == "none":
-            raise SceneError("psd 'none': linear 'partitioned' cannot stop at an indefinite matrix; use 'sweep'")
-        super().__init__(model, group, options, linear, midpoint, split)
+        self.width = math.isqrt(group.nodes - 1) + 1
+        super().__init__(model, group, options, linear, midpoint, split, ranges=-(-group.nodes // self.width))
         kind, device, real = group.kind, model.wp_device, self.real
         vector, columns = wp.types.vector(kind.dim, real), group.columns
-        self.width = math.isqrt(group.nodes - 1) + 1
-        self.ranges = -(-group.nodes // self.width)
         self.midpoint = midpoint
-        self.partial = device_arrays.allocate((4, self.ranges, columns), real, device)
         self.sums = device_arrays.allocate((2, self.ranges, columns), vector, device)
         self.prefix = device_arrays.allocate((group.nodes, columns), vector, device)
         self.mean = wp.zeros(columns, dtype=vector, device=device)
@@ -41,8 +36,6 @@ class RodNewtonParallel(AssembledNewton):
         else:
             self.reduction = CyclicReduction(kind.block, group.nodes, columns, self.linear, device)
         self.split = split
-        self._weigh, self._gauge = line_search_parallel.sum_kernels(kind, real, self.linear)
-        self._judge, self._take = line_search_parallel.decide_kernels(kind, real, self.linear, self.exact)
         self._moves = rod_iterate_parallel.move_kernels(kind, real, self.linear, split)
         self._turn_ahead, *_ = rod_iterate_parallel.move_kernels(kind, real, self.linear)
         self._aim, self._renew, self._again = rod_iterate_parallel.predict_kernels(kind, real, self.linear)
@@ -50,12 +43,11 @@ class RodNewtonParallel(AssembledNewton):
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        result = [self._weigh, self._gauge, self._judge, self._take, *self._moves, self._aim]
+        result = [*self._moves, self._aim]
         result += [self._renew] if self.midpoint else [self._again]
         result += [self._turn_ahead] * self.split  # without `split`, it is among the moves
         replaced = self._predict, self._further  # replaced by kernels of this class
-        around = [kernel for kernel in self.kernels_around if kernel not in replaced]
-        return [*around, self._assemble, *result, *self.reduction.kernels]
+        return [*(kernel for kernel in super().kernels if kernel not in replaced), *result, *self.reduction.kernels]
 
     def predict(self, before) -> None:
         """Recompute the predictor of bent rods from the state `before` by rotating edges; carry frames to midpoints."""
@@ -76,32 +68,6 @@ class RodNewtonParallel(AssembledNewton):
         wp.launch(self._again, self.group.columns, self.islands.arrays, device=self.device)
         self.move(EXTRAPOLATE_ROTATED, base=predicted, now=before.x)
 
-    def sweep(self) -> None:
-        """Assemble, decide, solve for a direction and take it."""
-        self.assemble_blocks()
-        self.judge()
-        self.direct()
-        self.take()
-        self.move()
-
-    @timer("line search")
-    def judge(self) -> None:
-        """Stop rods, reject their iterates, or request a direction."""
-        options = self.options
-        self._launch(
-            self._weigh,
-            self.ranges,
-            [self.rhs, self.energy_change, self.energy_noise, self.group.count, self.islands.status, self.ranges],
-            [self.partial],
-        )
-        wp.launch(
-            self._judge,
-            self.group.columns,
-            [self.partial, self.ranges, options.floor_factor * self.eps, options.max_iterations, options.max_halvings]
-            + self.islands.arrays,
-            device=self.device,
-        )
-
     @timer("cyclic reduction")
     def direct(self) -> None:
         """Compute directions by cyclic reduction."""
@@ -112,23 +78,6 @@ class RodNewtonParallel(AssembledNewton):
             self.reduction.solve(
                 self.blocks, self.rhs, self.group.count, islands.needs_direction, self.direction, islands.lost_pivots
             )
-
-    @timer("step length")
-    def take(self) -> None:
-        """Compute the step lengths along the directions."""
-        group = self.group
-        self._launch(
-            self._gauge,
-            self.ranges,
-            [self.rhs, self.direction, self.x, group.count, self.islands.needs_direction, self.ranges],
-            [self.base, self.partial],
-        )
-        wp.launch(
-            self._take,
-            group.columns,
-            [self.partial, self.ranges, self.options.rotation_cap, *self.islands.arrays],
-            device=self.device,
-        )
 
     @timer("edge rotation")
     def move(self, onward: int | None = None, base: wp.array | None = None, now: wp.array | None = None) -> None:
@@ -164,10 +113,6 @@ class RodNewtonParallel(AssembledNewton):
             + [self.prefix, self.sums, self.mean, self.width, self.new_frame],
             [self.x, self.theta, self.frame, base],
         )
-
-    def _launch(self, kernel, size: int, inputs: list, outputs: list) -> None:
-        """Launch one thread for each of `size` ranges or nodes of every rod."""
-        wp.launch(kernel, (size, self.group.columns), inputs, outputs, device=self.device)
 
 
 def _fixed_neighbours(group) -> np.ndarray:

@@ -16,12 +16,13 @@ from ddg_warp.model.state import State, check_state
 from ddg_warp.solve.forces.control_loads import LOADS, Given
 from ddg_warp.solve.forces.gyroscopic import Gyroscope
 from ddg_warp.solve.forces.prescribed_motion import counts_revolutions, rotations_between
+from ddg_warp.solve.newton.coupled_newton import PRECONDITIONERS
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
 from ddg_warp.solve.stepping import energy_drift
 from ddg_warp.solve.stepping.coupled_step import CoupledStep
 from ddg_warp.solve.stepping.graph_cache import Graphs
 from ddg_warp.solve.stepping.local_error import VelocityChange
-from ddg_warp.solve.stepping.rod_step import COUPLED_ONLY, RodStep
+from ddg_warp.solve.stepping.rod_step import RodStep
 from ddg_warp.solve.stepping.state_buffers import StateBuffer
 from ddg_warp.solve.stepping.world_reset import WorldReset, outcomes
 from ddg_warp.timers import timer
@@ -55,12 +56,12 @@ class Integrator:
         scheme: "implicit_euler" (first order, damps unresolved motion) or "implicit_midpoint" (second order, A-stable, conserves the
             energy of linear oscillations).
         solver: "newton", or "projective": modified Newton, with the Hessian of the first iterate throughout a step.
-        linear: linear solver. Rod groups take `"sweep"` (block LDL^T), `"partitioned"` (block cyclic reduction), or PCG with the
-            preconditioner `"jacobi"`, `"block_jacobi"` or `"chain"` (substructuring). The coupled system takes PCG with
-            `"block_jacobi"`, `"chain"`, `"multilevel"` (fewer, longer iterations for large sheets) or `"chain_multilevel"` (both).
-            For rod groups `"auto"` takes the sweep, cyclic reduction for few long rods on CUDA, and `"chain"` for closed rods. For the
-            coupled system it decides by the number of nodes between joints and of other nodes. It also steps rods coupled by contact
-            alone as uncoupled rods, per world, while no pair is in range.
+        linear: linear solver. Rod groups take `"sweep"` (block LDL^T, with a Schur complement for closed rods) or, without closed
+            rods, `"partitioned"` (block cyclic reduction). The coupled system takes PCG with `"block_jacobi"`, `"chain"`
+            (substructuring), `"multilevel"` (fewer, longer iterations for large sheets) or `"chain_multilevel"` (both); rod groups
+            next to it then take `"auto"`. For rod groups `"auto"` takes the sweep, or cyclic reduction for few long rods on CUDA. For
+            the coupled system it decides by the number of nodes between joints and of other nodes. It also steps rods coupled by
+            contact alone as uncoupled rods, per world, while no pair is in range.
         rtol, max_iterations, ...: see `NewtonOptions`.
         retry_limit: consecutive retries of a failed step: first a cold start, then half the step, and so on, down to
             2^-(retry_limit / 2) of the step.
@@ -103,7 +104,7 @@ class Integrator:
         check_model("Integrator", model)
         argument_checks.choice("scheme", scheme, SCHEMES)
         argument_checks.choice("solver", solver, SOLVERS)
-        if model.coupled is None and linear in COUPLED_ONLY:
+        if model.coupled is None and linear in PRECONDITIONERS:
             raise SceneError(
                 f"linear = {linear!r} is for coupled systems; uncoupled rods take 'auto', or see `Integrator`"
             )

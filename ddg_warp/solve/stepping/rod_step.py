@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ddg_warp import device_arrays
+from ddg_warp import argument_checks, device_arrays
 from ddg_warp.compile.precision import largest_carried
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.elements import element_path
@@ -15,14 +15,14 @@ from ddg_warp.solve.forces.drag import RodGroupDrag
 from ddg_warp.solve.forces.loads import Loads
 from ddg_warp.solve.forces.prescribed_motion import Motion
 from ddg_warp.solve.linear.solver_selection import automatic
+from ddg_warp.solve.newton.coupled_newton import PRECONDITIONERS
 from ddg_warp.solve.newton.rod_newton import RodNewton
+from ddg_warp.solve.newton.rod_newton_assembled import EliminationNewton, RodModifiedNewton
 from ddg_warp.solve.newton.rod_newton_parallel import RodNewtonParallel
-from ddg_warp.solve.newton.rod_newton_pcg import PcgNewton, RodModifiedNewton
 from ddg_warp.solve.stepping import energy_drift
 from ddg_warp.solve.stepping.step_driver import USUAL, StepDriver
 
 DIRECT = {"sweep": RodNewton, "partitioned": RodNewtonParallel}  # solvers of open rods by their name
-COUPLED_ONLY = ("multilevel", "chain_multilevel")  # preconditioners of the coupled system
 
 
 class RodStep(StepDriver):
@@ -182,18 +182,17 @@ class RodStep(StepDriver):
 
 def _newton(model, group, integrator, means) -> RodNewton:
     """Return the solver of a group selected by the integrator's `linear`."""
-    linear = automatic(group) if integrator.linear in ("auto", *COUPLED_ONLY) else integrator.linear
-    options = integrator.options
-    if options.psd == "auto" and means.stiff and integrator.solver == "newton" and linear in (*DIRECT, "chain"):
+    options, linear = integrator.options, integrator.linear
+    argument_checks.choice("linear", linear, ("auto", *DIRECT, *(PRECONDITIONERS if model.coupled else ())))
+    linear = linear if linear in DIRECT else automatic(group)
+    if options.psd == "auto" and means.stiff and integrator.solver == "newton":
         options = replace(options, psd="progressive")
     arguments = (model, group, options)
     last = (means.linear, integrator.scheme == "implicit_midpoint")
     if integrator.solver == "projective":
         return RodModifiedNewton(*arguments, *last)
-    if linear in tuple(DIRECT) and group.kind.closed:
-        raise SceneError(
-            f"linear {linear!r}: rod {group.host.rods[0]} is closed; use 'auto' or a preconditioner of PCG"
-        )
-    if linear in tuple(DIRECT):
+    if not group.kind.closed:
         return DIRECT[linear](*arguments, *last, split=means.split)
-    return PcgNewton(*arguments, linear, *last)
+    if linear == "partitioned":
+        raise SceneError(f"linear 'partitioned': rod {group.host.rods[0]} is closed; use 'auto' or 'sweep'")
+    return EliminationNewton(*arguments, *last)

@@ -1,4 +1,4 @@
-"""Blocks, products, factors and PCG of open and closed rods, against dense matrices and the sweep."""
+"""Blocks and block LDL^T of open and closed rods against dense matrices, and rings against the coupled system."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,9 @@ import warp as wp
 
 import ddg_warp as ddg
 from ddg_warp import device_arrays
-from ddg_warp.kernels.linear import rod_matrix, rod_pcg
+from ddg_warp.solve.linear.cyclic_reduction import Elimination
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
-from ddg_warp.solve.newton.rod_newton_pcg import PcgNewton
+from ddg_warp.solve.newton.rod_newton_assembled import EliminationNewton
 
 KINDS = {"twist": {}, "planar": {"dimension": 2}, "stretch": {"bend": False}}
 # Every kind of rod compiles separate kernels: daily runs take the closed one with all terms.
@@ -53,14 +53,12 @@ def scene_of(name, closed, counts=(7, 6)) -> ddg.Scene:
 class Problem:
     """Newton iteration of two rods in two worlds at a random state, with dense matrices to compare kernels with."""
 
-    def __init__(self, name, closed, device, preconditioner="chain", precision="float64", scale=1.0, **options):
+    def __init__(self, name, closed, device, precision="float64", scale=1.0, **options):
         random = np.random.default_rng(11)
         self.model = scene_of(name, closed).build(device, precision, worlds=2)
         (self.group,) = self.model.groups
         self.kind, self.device, self.count = self.group.kind, device, np.tile(self.group.host.count, 2)
-        newton = self.newton = PcgNewton(
-            self.model, self.group, NewtonOptions(linear_rtol=1e-13, **options), preconditioner
-        )
+        newton = self.newton = EliminationNewton(self.model, self.group, NewtonOptions(**options))
         state = self.model.state().groups[0]
         x = device_arrays.download(state.x)
         device_arrays.assign(newton.x, scale * x + 0.1 * random.normal(size=x.shape))
@@ -124,24 +122,27 @@ class Problem:
 
     def blocks(self, column: int) -> np.ndarray:
         """Return the dense matrix of the kernel's blocks."""
-        nb, n = self.kind.block, int(self.count[column])
+        nb = self.kind.block
         stored = device_arrays.download(self.newton.blocks)[:, :, column].reshape(3, nb, nb, -1)
-        H = np.zeros((n, nb, n, nb))
-        for k in range(n):
-            H[k, :, k] += stored[0, ..., k]
-            for offset in range(1, self.kind.span + 1):
-                if self.kind.closed or k + offset < n:
-                    j = (k + offset) % n
-                    H[k, :, j] += stored[offset, ..., k]
-                    H[j, :, k] += stored[offset, ..., k].T
-        return H.reshape(n * nb, n * nb)
+        return assembled(stored, int(self.count[column]), self.kind)
 
     def vector(self, array) -> np.ndarray:
         """Return a device block vector as (columns, n, block)."""
         return device_arrays.download(array).transpose(2, 1, 0)
 
-    def launch(self, kernel, dim, inputs, outputs):
-        wp.launch(kernel, dim, inputs, outputs, device=self.device)
+
+def assembled(blocks: np.ndarray, n: int, kind) -> np.ndarray:
+    """Return the dense matrix of a rod of n nodes from D, E and F of every node (3, block, block, nodes)."""
+    nb = kind.block
+    H = np.zeros((n, nb, n, nb))
+    for k in range(n):
+        H[k, :, k] += blocks[0, ..., k]
+        for offset in range(1, kind.span + 1):
+            if kind.closed or k + offset < n:
+                j = (k + offset) % n
+                H[k, :, j] += blocks[offset, ..., k]
+                H[j, :, k] += blocks[offset, ..., k].T
+    return H.reshape(n * nb, n * nb)
 
 
 @EVERY_CHAIN
@@ -161,133 +162,84 @@ def test_blocks_and_residual_match_dense(device, name, closed):
 
 
 @EVERY_CHAIN
-def test_product_matches_dense(device, name, closed):
-    """Compute H v; an inactive column keeps its values."""
-    problem = Problem(name, closed, device)
-    newton, (nodes, columns) = problem.newton, (problem.group.nodes, problem.group.columns)
-    random = np.random.default_rng(2)
-    v = random.normal(size=(problem.kind.block, nodes, columns))
-    device_arrays.assign(newton.p, v)
-    device_arrays.assign(newton.q, np.full_like(v, 7.0))
-    newton.islands.needs_direction.assign(np.array([1, 1, 0, 1], np.int32))
-    _, product, _ = rod_pcg.solver_kernels(problem.kind, newton.linear, "chain")
-    problem.launch(
-        product,
-        (nodes, columns),
-        [newton.blocks, newton.p, problem.group.count, newton.islands.needs_direction],
-        [newton.q, newton.busy],
-    )
-    product_values = problem.vector(newton.q)
-    for column, n in enumerate(problem.count):
-        if column == 2:
-            assert (product_values[column] == 7.0).all()
-            continue
-        expected = problem.dense(column)[0] @ v[:, :n, column].T.ravel()
-        np.testing.assert_allclose(
-            product_values[column, :n].ravel(), expected, rtol=0, atol=1e-13 * np.abs(expected).max()
-        )
-
-
-@EVERY_CHAIN
-def test_factors_solve_without_seam(device, name, closed):
-    """Factors solve with the open rod: couplings across the seam are omitted."""
-    problem = Problem(name, closed, device)
-    newton, kind = problem.newton, problem.kind
-    substitute = rod_matrix.substitute_function(kind.block, kind.span, newton.linear, dotted=True)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def solve(
-        factor: wp.array3d(dtype=wp.float64),
-        v: wp.array3d(dtype=wp.float64),
-        out: wp.array3d(dtype=wp.float64),
-        count: wp.array(dtype=int),
-        total: wp.array(dtype=wp.float64),
-    ):
-        r = wp.tid()
-        total[r] = substitute(factor, v, out, count[r], r, r)
-
-    total = wp.zeros(problem.group.columns, dtype=wp.float64, device=device)
-    problem.launch(solve, problem.group.columns, [newton.factors, newton.rhs], [newton.z, problem.group.count, total])
-    solution = problem.vector(newton.z)
+def test_direction_matches_dense_solve(device, name, closed):
+    """Stretched, the rods have definite matrices."""
+    problem = Problem(name, closed, device, scale=1.5)
+    newton = problem.newton
+    direction, decrement = problem.vector(newton.direction), device_arrays.download(newton.islands.predicted_decrease)
     for column, n in enumerate(problem.count):
         H, r, _ = problem.dense(column)
-        node = np.arange(len(H)) // kind.block
-        H = np.where(np.abs(node[:, None] - node) <= kind.span, H, 0.0)
         expected = np.linalg.solve(H, r)
-        np.testing.assert_allclose(solution[column, :n].ravel(), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-        assert total.numpy()[column] == pytest.approx(r @ expected, rel=1e-12)
+        np.testing.assert_allclose(direction[column, :n].ravel(), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+        assert decrement[column] == pytest.approx(r @ expected, rel=1e-12)
     assert (device_arrays.download(newton.islands.lost_pivots_total) == 0).all()
 
 
 @EVERY_CHAIN
-@pytest.mark.parametrize("preconditioner", rod_pcg.PRECONDITIONERS)
-def test_direction_matches_dense_solve(device, name, closed, preconditioner):
-    """PCG matches; with the exact preconditioner an open rod takes one iteration."""
-    problem = Problem(name, closed, device, preconditioner)
-    newton = problem.newton
-    direction, decrement = problem.vector(newton.direction), device_arrays.download(newton.islands.predicted_decrease)
-    iterations = device_arrays.download(newton.iterations)
-    for column, n in enumerate(problem.count):
-        H, r, _ = problem.dense(column)
-        expected = np.linalg.solve(H, r)
-        np.testing.assert_allclose(direction[column, :n].ravel(), expected, rtol=0, atol=1e-10 * np.abs(expected).max())
-        assert decrement[column] == pytest.approx(r @ expected, rel=1e-10)
-    if preconditioner == "chain" and not closed:
-        assert (iterations == 1).all()
-    elif preconditioner == "chain":
-        assert (
-            iterations <= 4 * problem.kind.block * problem.kind.span + 2
-        ).all()  # rank of the coupling across the seam
-    else:
-        assert (iterations > 3).all()
+def test_elimination_of_short_rods(device, name, closed):
+    """Rods of 3 to 9 nodes: solutions match dense matrices, and lost pivots are the negative eigenvalues of indefinite ones."""
+    kind, counts, random = Problem(name, closed, device).kind, np.arange(3, 10), np.random.default_rng(3)
+    nb, columns = kind.block, len(counts)
+    blocks, dense = np.zeros((3, nb, nb, 9, columns)), []
+    for column, n in enumerate(counts):
+        blocks[:, ..., :n, column] = random.normal(size=(3, nb, nb, n))
+        diagonal = blocks[0, ..., :n, column]
+        diagonal += diagonal.swapaxes(0, 1) + (6.0 * nb if column % 2 else 1.0) * np.eye(nb)[..., None]
+        dense.append(assembled(blocks[..., column], n, kind))
+    rhs = random.normal(size=(nb, 9, columns))
+    solver = Elimination(kind, 9, columns, wp.float64, device)
+    matrix, right, solution = (
+        device_arrays.allocate((rows, 9, columns), wp.float64, device) for rows in (3 * nb**2, nb, nb)
+    )
+    device_arrays.assign(matrix, blocks.reshape(3 * nb**2, 9, columns))
+    device_arrays.assign(right, rhs)
+    count, wanted = wp.array(counts, dtype=int, device=device), wp.ones(columns, dtype=int, device=device)
+    lost = wp.zeros(columns, dtype=int, device=device)
+    solver.solve(matrix, right, count, wanted, solution, lost)
+    solutions = device_arrays.download(solution)
+    for column, (n, H) in enumerate(zip(counts, dense, strict=True)):
+        negative = int((np.linalg.eigvalsh(H) < 0.0).sum())
+        assert bool(lost.numpy()[column]) == bool(negative)
+        assert negative > 0 or column % 2
+        if not negative:
+            expected = np.linalg.solve(H, rhs[:, :n, column].T.ravel())
+            np.testing.assert_allclose(solutions[:, :n, column].T.ravel(), expected, rtol=0, atol=1e-12)
 
 
-def falling(name, closed, device, precision="float64", **options):
-    """Return the points after 10 steps, the statistics, and the initial points."""
-    model = scene_of(name, closed, (9, 8)).build(device, precision)
-    integrator, state = ddg.Integrator(model, **options), model.state()
-    for _ in range(10):
-        state = integrator.step(state, 0.02)
-    integrator.check(state)
-    return state.points(), integrator.statistics(), model.state().points()
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name == "twist" else pytest.mark.slow) for name in KINDS]
-)
-@pytest.mark.parametrize("preconditioner", rod_pcg.PRECONDITIONERS)
-def test_open_rods_match_sweep(device, name, preconditioner):
-    """Solvers stop at slightly different iterates; at a tolerance of all digits they agree to rounding."""
-    exact, swept, start = falling(name, False, device, linear="sweep", rtol=1e-14)
-    points, statistics, _ = falling(name, False, device, linear=preconditioner, rtol=1e-14, linear_rtol=1e-12)
-    assert np.abs(exact - start).max() > 0.05
-    np.testing.assert_allclose(points, exact, rtol=0, atol=1e-11)
-    assert swept["pcg_iterations"] == 0
-    assert set(statistics["outcomes"]) <= {"converged", "converged_to_rounding"}
-    if preconditioner == "chain":
-        iterations = statistics["newton_iterations"]["mean"] * sum(statistics["outcomes"].values())
-        assert 0 < statistics["pcg_iterations"] <= 1.2 * iterations
-
-
-@pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
-def test_preconditioners_agree_on_closed_ring(device, precision):
-    """A ring clamped at one edge falls equally with every preconditioner."""
+def test_ring_falls_as_in_a_coupled_system(device):
+    """A ring clamped at one edge falls as the same ring that contact couples, which conjugate gradients solve."""
     angle = 2.0 * np.pi * np.arange(40) / 40
     points = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], -1)
-    ends, iterations = [], []
-    for preconditioner in ("auto", *rod_pcg.PRECONDITIONERS):
+    ends = []
+    for is_coupled in (False, True):
         scene = ddg.Scene()
         ring = scene.add_rod(points, section=ddg.Circle(0.02), material=ddg.Material(1e7, 0.5, 1000.0), closed=True)
         scene.clamp(ring, [0])
-        model = scene.build(device, precision)
-        integrator, state = ddg.Integrator(model, linear=preconditioner, rtol=1e-8), model.state()
+        if is_coupled:
+            scene.contact()
+        model = scene.build(device, "float64")
+        assert bool(model.groups) != is_coupled
+        integrator, state = ddg.Integrator(model, rtol=1e-10), model.state()
         for _ in range(10):
             state = integrator.step(state, 0.02)
         integrator.check(state)
         ends.append(state.points())
-        iterations.append(integrator.statistics()["pcg_iterations"])
+        assert bool(integrator.statistics()["pcg_iterations"]) == is_coupled
     assert np.abs(ends[0] - points).max() > 0.05
-    np.testing.assert_array_equal(ends[0], ends[3])  # "auto" selects `chain`
-    for end in ends[1:]:
-        np.testing.assert_allclose(end, ends[0], rtol=0, atol=1e-7)
-    assert iterations[3] < iterations[2] < iterations[1]
+    np.testing.assert_allclose(ends[1], ends[0], rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("closed", [pytest.param(False, marks=pytest.mark.slow), True])
+def test_projective_matches_newton(device, closed):
+    """The frozen matrix of a ring includes the closure: few iterations, and the same solution."""
+    ends, iterations = [], []
+    for solver in ("newton", "projective"):
+        model = scene_of("twist", closed, (9, 8)).build(device, "float64")
+        integrator, state = ddg.Integrator(model, solver=solver, rtol=1e-10), model.state()
+        for _ in range(5):
+            state = integrator.step(state, 0.005)
+        integrator.check(state)
+        ends.append(state.points())
+        iterations.append(integrator.statistics()["newton_iterations"]["mean"])
+    np.testing.assert_allclose(ends[1], ends[0], rtol=0, atol=1e-8)
+    assert iterations[1] < 12.0
