@@ -151,11 +151,13 @@ def bytes_per_node(model, group) -> int:
     real, linear = (4 if t.__name__ == "float32" else 8 for t in (model.types.real, model.types.linear))
     state = 2 * kind.dim + (9 if kind.twist else 0) + (kind.strain_rows if kind.viscous else 0)
     iterate = 2 * kind.dim + (9 if kind.twist else 0) + kind.window + 2
-    solver = kind.factor_rows + 2 * nb**2 + 2 * nb + 1
+    solver = kind.factor_rows + 2 * nb + 1
     constant = 2 * real + 1
     if kind.closed:
-        solver += nb**2 + rod_elimination.kept_rows(kind)
-    if automatic(group) == "partitioned":
+        solver += 3 * nb**2 + rod_elimination.kept_rows(kind)
+    elif automatic(group) == "sweep":
+        solver += 2 * nb**2
+    else:
         iterate += kind.dim + (7 if kind.twist else 0) + 2
         solver += 3 * nb**2 + nb + sum(cyclic_reduction.level_rows(nb)) // 2
         constant += 8

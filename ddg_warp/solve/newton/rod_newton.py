@@ -118,8 +118,6 @@ class RodNewton:
         self.gradient = make(kind.window, *nodes)
         self.energy = make(2, *nodes)
         self.stiffness = make(*nodes, dtype=self.linear)
-        kept = 2 * kind.block**2 + kind.block + (mixed_axial_force.kept_rows(kind.block) if split else 0)
-        self.elimination = make(kept, *nodes, dtype=self.linear) if not kind.closed else None
         self.rhs, self.direction = (make(rows, *nodes, dtype=self.linear) for rows in (kind.block, kind.block + split))
         self.energy_change, self.energy_noise = make(*nodes), make(*nodes, dtype=self.linear)
         self.islands = Islands(columns, self.real, device)
@@ -154,10 +152,16 @@ class RodNewton:
         self._check = rod_residual.check_kernel(kind, self.real, self.linear)
         self._predict = rod_step.predict_kernel(kind, self.real, self.linear, midpoint)
         self._further = None if midpoint else warm_start.further_kernel(kind, self.real, self.linear)
-        self._sweep, self._threads = None, 32 if columns < MANY else 128
-        if not kind.closed:
-            self._sweep = sweep.sweep_kernel(kind, self.real, self.linear, self.exact_from, self.psd == "none", split)
-        self._adjust = None if kind.closed else rod_iterate.adjust_kernel(kind, self.real, self.linear, split)
+        self._prepare_sweep(split)
+
+    def _prepare_sweep(self, split: bool) -> None:
+        """Allocate the data of eliminated nodes, and build the kernels of an iteration."""
+        group, kind = self.group, self.group.kind
+        kept = 2 * kind.block**2 + kind.block + (mixed_axial_force.kept_rows(kind.block) if split else 0)
+        self.elimination = device_arrays.allocate((kept, group.nodes, group.columns), self.linear, self.device)
+        self._threads = 32 if group.columns < MANY else 128
+        self._sweep = sweep.sweep_kernel(kind, self.real, self.linear, self.exact_from, self.psd == "none", split)
+        self._adjust = rod_iterate.adjust_kernel(kind, self.real, self.linear, split)
 
     def automatic_psd(self) -> str:
         """Return the mode of `NewtonOptions.psd` that suits the rods: Gauss-Newton lacks the effect of natural curvature on roll."""

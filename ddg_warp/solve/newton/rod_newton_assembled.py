@@ -42,6 +42,9 @@ class AssembledNewton(RodNewton):
         self._weigh, self._gauge = line_search.sum_kernels(kind, self.real, self.linear)
         self._judge, self._take = line_search.decide_kernels(kind, self.real, self.exact, self.psd == "none")
 
+    def _prepare_sweep(self, split: bool) -> None:
+        """Do nothing: the matrix is assembled, not swept."""
+
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture, except the kernels of `direct` and `move`."""
