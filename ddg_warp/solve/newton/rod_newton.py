@@ -272,17 +272,17 @@ class RodNewton:
         self.eliminate()
         self.adjust()
 
+    @timer("edge rotation")
     def adjust(self) -> None:
         """Complete an iteration: shorten or rotate steps, and update frames."""
         group = self.group
-        with timer("edge rotation"):
-            wp.launch(
-                self._adjust,
-                group.columns,
-                [group.count, group.fixed, group.anchor, self.direction, *self.islands.arrays],
-                [self.x, self.theta, self.frame, self.base],
-                device=self.device,
-            )
+        wp.launch(
+            self._adjust,
+            group.columns,
+            [group.count, group.fixed, group.anchor, self.direction, *self.islands.arrays],
+            [self.x, self.theta, self.frame, self.base],
+            device=self.device,
+        )
 
     @timer("block LDL^T sweep")
     def eliminate(self) -> None:

@@ -137,7 +137,6 @@ class EliminationNewton(AssembledNewton):
         count, islands = self.group.count, self.islands
         self.solver.solve(self.blocks, self.rhs, count, islands.needs_direction, self.direction, islands.lost_pivots)
 
-    @timer("edge rotation")
     def move(self) -> None:
         """Apply the pending update of every rod."""
         self.adjust()
