@@ -175,7 +175,7 @@ FAULTS = (
         "kernels/stepping/time_step.py",
         "coefficient = rate * (rate + damping[0])",
         "coefficient = rate * rate",
-        ("tests/test_edge_rotation_steps.py", "tests/learn/test_adjoint.py"),
+        ("tests/test_edge_rotation_steps.py", "tests/adjoint/test_adjoint.py"),
     ),
     Fault(
         "drag: tangential and normal coefficient swapped",
@@ -219,14 +219,14 @@ FAULTS = (
         "kernels/adjoint/time_step.py",
         "by_v = w_free * (rho * m) - ended * before_kept",
         "by_v = w_free * (rho * m)",
-        ("tests/learn/test_adjoint.py",),
+        ("tests/adjoint/test_adjoint.py",),
     ),
     Fault(
         "adjoint of friction: lagged positions and start swapped",
         "ddg_warp/adjoint/contact.py",
         "zip(written, (grad_q, by_before, by_lagged), strict=True)",
         "zip(written, (grad_q, by_lagged, by_before), strict=True)",
-        ("tests/learn/test_contact_adjoint.py",),
+        ("tests/adjoint/test_contact_adjoint.py",),
     ),
     # host: compilation, solvers, post-processing
     Fault(
@@ -262,7 +262,7 @@ FAULTS = (
         "ddg_warp/solve/equilibrium/friction_jacobian.py",
         "by_x[:PAIR_NODES] += by_lagged[:PAIR_NODES]",
         "by_x[:PAIR_NODES] += 0.0 * by_lagged[:PAIR_NODES]",
-        ("tests/learn/test_contact_equilibria.py",),
+        ("tests/adjoint/test_contact_equilibria.py",),
     ),
     Fault(
         "end moments: directors of the inner edge instead of the clamp",

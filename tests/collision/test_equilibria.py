@@ -16,9 +16,9 @@ from ddg_warp.solve.collision import candidate_list
 from ddg_warp.solve.equilibrium import dynamic_relaxation, stability
 from ddg_warp.solve.equilibrium.newton_pcg import CoupledEquilibrium
 from ddg_warp.solve.equilibrium.tangent import Tangent
+from tests.adjoint.contact_cases import SCENES, scene_of, touching
+from tests.adjoint.differences import built
 from tests.collision.brute_force import edge_edge
-from tests.learn.contact_cases import SCENES, scene_of, touching
-from tests.learn.differences import built
 
 RUBBER = ddg.Material(young=1e7, density=1000.0, poisson=0.5)
 G = 9.81  # m/s^2

@@ -15,10 +15,10 @@ from ddg_warp.solve.equilibrium.coupled_tangent import CoupledTangent
 from ddg_warp.solve.linear.exact_system import ExactSystem
 from ddg_warp.solve.linear.pcg import PCG
 from ddg_warp.torch import Simulator
-from tests.learn import differences
-from tests.learn.differences import TIGHT, built, cotangent, directions, entries, moving_state
-from tests.learn.test_adjoint import DT, SCENES, SOFT
-from tests.learn.test_torch import STIFFNESS
+from tests.adjoint import differences
+from tests.adjoint.differences import TIGHT, built, cotangent, directions, entries, moving_state
+from tests.adjoint.test_adjoint import DT, SCENES, SOFT
+from tests.torch.test_torch import STIFFNESS
 
 RATE = 1.0 / DT
 

@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 import ddg_warp as ddg
 from ddg_warp.errors import SceneError
-from tests.learn.differences import CLOSE, TIGHT, built
-from tests.learn.test_adjoint import DT, SOFT, a_scene
+from tests.adjoint.differences import CLOSE, TIGHT, built
+from tests.adjoint.test_adjoint import DT, SOFT, a_scene
 
 torch = pytest.importorskip("torch")
 from ddg_warp.rl.environment import Environment, GripRates  # noqa: E402

@@ -12,7 +12,7 @@ import pytest
 import ddg_warp as ddg
 from ddg_warp.errors import GradientWarning, SceneError
 from ddg_warp.torch.gradient_check_scenes import scene_of
-from tests.learn import differences
+from tests.adjoint import differences
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import Simulator, WorldState  # noqa: E402

@@ -5,8 +5,8 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.errors import SceneError
-from tests.learn.differences import CLOSE, TIGHT, built
-from tests.learn.test_adjoint import DT, SCENES
+from tests.adjoint.differences import CLOSE, TIGHT, built
+from tests.adjoint.test_adjoint import DT, SCENES
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import Simulator  # noqa: E402

@@ -4,7 +4,7 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from tests.learn.differences import TIGHT, StateMask, entries, put
+from tests.adjoint.differences import TIGHT, StateMask, entries, put
 
 RADIUS, RANGE, DT = 2e-3, 1e-3, 0.002
 SOFT = ddg.Material(young=1e6, density=1000.0, viscosity=0.01)

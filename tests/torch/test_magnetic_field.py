@@ -5,12 +5,12 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.errors import SceneError
-from tests.learn.differences import TIGHT, built
-from tests.learn.test_adjoint import CURVE, DT, SOFT
+from tests.adjoint.differences import TIGHT, built
+from tests.adjoint.test_adjoint import CURVE, DT, SOFT
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import Simulator  # noqa: E402
-from tests.learn.test_torch import check, normal  # noqa: E402
+from tests.torch.test_torch import check, normal  # noqa: E402
 
 
 @pytest.fixture

@@ -10,11 +10,11 @@ import ddg_warp as ddg
 from ddg_warp import statics
 from ddg_warp.adjoint.implicit import EquilibriumAdjoint
 from ddg_warp.errors import SceneError, SolverError
-from tests.learn import differences
-from tests.learn.contact_cases import MESH, RADIUS, RANGE, bar, rod, sheet
-from tests.learn.differences import built, check, cotangent, parameter_shifts
-from tests.learn.test_contact_adjoint import number_shifts
-from tests.learn.test_equilibrium_adjoint import RTOL, check_load, difference_of, position_weights
+from tests.adjoint import differences
+from tests.adjoint.contact_cases import MESH, RADIUS, RANGE, bar, rod, sheet
+from tests.adjoint.differences import built, check, cotangent, parameter_shifts
+from tests.adjoint.test_contact_adjoint import number_shifts
+from tests.adjoint.test_equilibrium_adjoint import RTOL, check_load, difference_of, position_weights
 from tests.pairwise import covering
 
 slow = pytest.mark.slow
@@ -178,7 +178,7 @@ def test_gradients_go_through_all_load_steps(name):
     """Gradients by final poses, of which each load step takes a fraction, by forces, and by contact parameters."""
     torch = pytest.importorskip("torch")
     from ddg_warp.torch import Simulator
-    from tests.learn.test_torch import check as check_along
+    from tests.torch.test_torch import check as check_along
 
     model, poses = gripped(*GRIPPED[name])
     simulator = Simulator(model, 0.01)

@@ -11,7 +11,7 @@ from ddg_warp.errors import SceneError
 
 torch = pytest.importorskip("torch")
 from ddg_warp.rl.environment import Environment  # noqa: E402
-from tests.learn.test_environment import RATES, WORLDS, draw, environment, gripped, observe, off  # noqa: E402
+from tests.rl.test_environment import RATES, WORLDS, draw, environment, gripped, observe, off  # noqa: E402
 
 
 @pytest.mark.parametrize(

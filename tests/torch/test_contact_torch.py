@@ -5,15 +5,15 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.errors import SceneError
-from tests.learn import differences
-from tests.learn.contact_cases import DT, RADIUS, RANGE, SOFT, bar, scene_of, touching
-from tests.learn.differences import TIGHT
+from tests.adjoint import differences
+from tests.adjoint.contact_cases import DT, RADIUS, RANGE, SOFT, bar, scene_of, touching
+from tests.adjoint.differences import TIGHT
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import RodParameters, ShellParameters, Simulator  # noqa: E402
 from ddg_warp.torch.contact_parameters import contact_elements  # noqa: E402
-from tests.learn.test_torch import check  # noqa: E402
 from tests.pairwise import covering  # noqa: E402
+from tests.torch.test_torch import check  # noqa: E402
 
 WITH_FRICTION = {"friction": 0.3, "velocity": 0.05}
 

@@ -5,13 +5,13 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.errors import SceneError
-from tests.learn import differences
-from tests.learn.differences import TIGHT, built
-from tests.learn.test_adjoint import CURVE, DT, SCENES, SOFT, T, a_scene
+from tests.adjoint import differences
+from tests.adjoint.differences import TIGHT, built
+from tests.adjoint.test_adjoint import CURVE, DT, SCENES, SOFT, T, a_scene
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import RodParameters, ShellParameters, Simulator, gradient_check_scenes  # noqa: E402
-from tests.learn.test_torch import check, normal  # noqa: E402
+from tests.torch.test_torch import check, normal  # noqa: E402
 
 SECTIONS = {
     "circle": lambda c: ddg.Circle(0.004 * c),

@@ -7,8 +7,8 @@ import ddg_warp as ddg
 from ddg_warp import device_arrays, statics
 from ddg_warp.adjoint.implicit import EquilibriumAdjoint
 from ddg_warp.errors import SolverError
-from tests.learn.differences import Difference, built, check, close, cotangent, directions, parameter_shifts, product
-from tests.learn.test_adjoint import SCENES
+from tests.adjoint.differences import Difference, built, check, close, cotangent, directions, parameter_shifts, product
+from tests.adjoint.test_adjoint import SCENES
 
 RTOL = 1e-13
 

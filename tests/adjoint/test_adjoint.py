@@ -8,7 +8,7 @@ from ddg_warp.adjoint.implicit import Adjoint
 from ddg_warp.compile import precision
 from ddg_warp.errors import SolverError
 from ddg_warp.geometry import meshes
-from tests.learn.differences import (
+from tests.adjoint.differences import (
     TIGHT,
     built,
     check_length,

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from ddg_warp.postprocess.sag_free import rest_strains
-from tests.learn import differences
+from tests.adjoint import differences
 from tests.test_sag_free import scene_of_all
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import Simulator  # noqa: E402
-from tests.learn.test_torch import normal  # noqa: E402
+from tests.torch.test_torch import normal  # noqa: E402
 
 ALONE = 66  # nodes of the first two rods, which bear their weight alone
 

@@ -5,8 +5,8 @@ import pytest
 import ddg_warp as ddg
 from ddg_warp.errors import SceneError
 from ddg_warp.run.cli import main
-from tests.learn.differences import TIGHT, built
-from tests.learn.test_adjoint import CURVE, DT, SCENES
+from tests.adjoint.differences import TIGHT, built
+from tests.adjoint.test_adjoint import CURVE, DT, SCENES
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import Simulator, gradient_check, gradient_check_scenes  # noqa: E402

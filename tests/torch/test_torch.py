@@ -12,9 +12,9 @@ import ddg_warp as ddg
 from ddg_warp.adjoint import linear_solve
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import meshes
-from tests.learn import differences
-from tests.learn.differences import CLOSE, SIDES, TIGHT, WEIGHTS, built
-from tests.learn.test_adjoint import CURVE, DT, SCENES, SOFT, a_scene
+from tests.adjoint import differences
+from tests.adjoint.differences import CLOSE, SIDES, TIGHT, WEIGHTS, built
+from tests.adjoint.test_adjoint import CURVE, DT, SCENES, SOFT, a_scene
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import RodParameters, ShellParameters, Simulator  # noqa: E402

@@ -10,12 +10,12 @@ import ddg_warp as ddg
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import meshes
 from ddg_warp.model.rest_shapes import grown_metric, principal_form
-from tests.learn.differences import TIGHT, built
-from tests.learn.test_adjoint import DT
+from tests.adjoint.differences import TIGHT, built
+from tests.adjoint.test_adjoint import DT
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import ShellParameters, Simulator  # noqa: E402
-from tests.learn.test_torch import check, normal  # noqa: E402
+from tests.torch.test_torch import check, normal  # noqa: E402
 
 NUMBERS, FORMS, MASS = ("young", "thickness", "poisson"), ("metric", "curvature"), ("density",)
 BENDING = ("midedge_dof", "midedge_boundary", "midedge", "hinge", "isometric")

@@ -10,8 +10,8 @@ from ddg_warp.adjoint.implicit import Adjoint
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.adjoint.contact import FRICTION, RANGE, STIFFNESS
 from ddg_warp.solve.linear.exact_system import ExactSystem
-from tests.learn.contact_cases import DT, SCENES, scene_of, touching
-from tests.learn.differences import (
+from tests.adjoint.contact_cases import DT, SCENES, scene_of, touching
+from tests.adjoint.differences import (
     TIGHT,
     Shift,
     along,

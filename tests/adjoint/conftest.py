@@ -2,11 +2,11 @@
 
 import pytest
 
-from tests.learn import differences
+from tests.adjoint import differences
 
 
 @pytest.fixture(autouse=True)
-def _everything_on(device, monkeypatch):
+def on_device(device, monkeypatch):
     monkeypatch.setattr(differences, "DEVICE", device)
     if device.startswith("cuda"):
         torch = pytest.importorskip("torch")
