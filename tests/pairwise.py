@@ -1,4 +1,4 @@
-"""Covering sets of parameter combinations: some are fast tests, all others slow."""
+"""Covering sets of parameter combinations: some are fast tests, all others slow; and sets that are chosen."""
 
 from collections import Counter
 from itertools import combinations, product
@@ -24,10 +24,19 @@ def covering(strength: int = 2, **values):
         missing -= covered[row]
         used.update(enumerate(row))
         fast.add(row)
+    return chosen([tuple(named[k][i] for k, i in enumerate(row)) for row in fast], **values)
+
+
+def chosen(fast, **values):
+    """Parametrize a test with all combinations of values, of which `fast` are fast.
+
+    Args:
+        fast: combinations as tuples; of one parameter, its values.
+        values: values of each parameter, by name.
+    """
+    rows, chosen_rows = list(product(*values.values())), [row if len(values) > 1 else (row,) for row in fast]
+    assert all(row in rows for row in chosen_rows)
+    marks = [() if row in chosen_rows else pytest.mark.slow for row in rows]
     return pytest.mark.parametrize(
-        tuple(values),
-        [
-            pytest.param(*(named[k][i] for k, i in enumerate(row)), marks=() if row in fast else pytest.mark.slow)
-            for row in rows
-        ],
+        tuple(values), [pytest.param(*row, marks=mark) for row, mark in zip(rows, marks, strict=True)]
     )

@@ -19,6 +19,7 @@ from tests.adjoint.differences import (
     parameter_shifts,
     vjp_of_steps,
 )
+from tests.pairwise import covering
 
 DT = 0.01
 SOFT = ddg.Material(young=1e6, density=1000.0, viscosity=0.01)
@@ -113,6 +114,7 @@ def stiffened():
     return scene
 
 
+SCHEMES = ("implicit_euler", "implicit_midpoint")
 SCENES = {
     "twisted": twisted,
     "clamped_end": clamped_end,
@@ -134,17 +136,13 @@ def differentiated(name: str, scheme: str, steps: int):
     return model, *vjp_of_steps(model, moving_state(model, scheme=scheme), DT, steps, scheme)
 
 
-CASES = [(name, scheme) for name in SCENES for scheme in ("implicit_euler", "implicit_midpoint")]
-
-
-@pytest.mark.parametrize(("name", "scheme"), CASES)
+@covering(1, name=SCENES, scheme=SCHEMES)
 def test_a_step_by_its_state_and_parameters(name, scheme):
     model, gradient, inputs, difference = differentiated(name, scheme, 1)
     check_state(model, gradient, difference, *parameter_shifts(model, inputs))
 
 
-@pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
-@pytest.mark.parametrize("name", ["twisted", "joined", "sheet"])
+@covering(1, name=("twisted", "joined", "sheet"), scheme=SCHEMES)
 def test_a_step_by_length_and_mass_damping(name, scheme):
     """The length of the step, damping by mass."""
     model, _, (inputs,), difference = differentiated(name, scheme, 1)
@@ -159,11 +157,7 @@ def test_a_step_by_length_and_mass_damping(name, scheme):
     assert close(float(step_inputs.damping.numpy().sum()), difference.by(damped, 1e-3))
 
 
-LONG = [(name, "implicit_euler") for name in ("twisted", "untwisted", "closed", "joined", "sheet")]
-LONG += [(name, "implicit_midpoint") for name in ("twisted", "planar", "joined")]
-
-
-@pytest.mark.parametrize(("name", "scheme"), LONG)
+@covering(1, name=("twisted", "untwisted", "planar", "closed", "joined", "sheet"), scheme=SCHEMES)
 def test_twenty_steps(name, scheme):
     model, gradient, inputs, difference = differentiated(name, scheme, 20)
     check_state(model, gradient, difference, *parameter_shifts(model, inputs))
@@ -199,8 +193,7 @@ def moving_clamp(joint=False):
 SCENES |= {"moving_clamp": moving_clamp, "moving_joined": lambda: moving_clamp(joint=True)}
 
 
-@pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
-@pytest.mark.parametrize("name", ["moving_clamp", "moving_joined"])
+@covering(1, name=("moving_clamp", "moving_joined"), scheme=SCHEMES)
 def test_steps_under_a_motion_that_rotates(name, scheme):
     model, gradient, _, difference = differentiated(name, scheme, 2)
     check_state(model, gradient, difference)
@@ -301,8 +294,7 @@ LAGGED = {
 SCENES |= LAGGED
 
 
-@pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
-@pytest.mark.parametrize("name", LAGGED)
+@covering(1, name=LAGGED, scheme=SCHEMES)
 def test_drag_and_follower_loads(name, scheme, monkeypatch):
     """Drag and follower loads are lagged: evaluated at the velocities and nodes of the start, or at the predicted nodes."""
     monkeypatch.setattr(precision, "STRAIGHT_ROTATION", 1e-3)
@@ -310,8 +302,7 @@ def test_drag_and_follower_loads(name, scheme, monkeypatch):
     check_state(model, gradient, difference, *parameter_shifts(model, inputs))
 
 
-@pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
-@pytest.mark.parametrize("name", ["couple, twisted", "sand, joined", "pressure"])
+@covering(1, name=("couple, twisted", "sand, joined", "pressure"), scheme=SCHEMES)
 def test_drag_and_follower_loads_by_the_length_of_the_step(name, scheme):
     _, _, (inputs,), difference = differentiated(name, scheme, 1)
     check_length(inputs[0], difference, DT, 1e-7, scheme)

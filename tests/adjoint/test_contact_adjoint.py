@@ -23,7 +23,7 @@ from tests.adjoint.differences import (
     parameter_shifts,
     vjp_of_steps,
 )
-from tests.pairwise import covering
+from tests.pairwise import chosen, covering
 
 WITH_FRICTION = {
     "friction": 0.3,
@@ -31,9 +31,17 @@ WITH_FRICTION = {
 }  # slip speeds are twice the stick threshold, those of rotation lower
 SLIDING = 0.1  # [m/s]
 ROWS = {"stiffness": STIFFNESS, "range": RANGE, "friction": FRICTION}
-each_scene = pytest.mark.parametrize("name", SCENES)
-lagged_once_or_twice = pytest.mark.parametrize("friction_iterations", [1, 2])
-each_law = pytest.mark.parametrize("law", ["barrier", "penalty"])
+lagged_once_or_twice = pytest.mark.parametrize("friction_iterations", [pytest.param(1, marks=pytest.mark.slow), 2])
+LAWS = ("barrier", "penalty")
+# Of every kind of pairs. Friction of several iterations is checked in every scene.
+WITHOUT_FRICTION = [("parallel rods", "barrier"), ("rod on plane", "penalty"), ("rod on mesh", "barrier")]
+WITHOUT_FRICTION += [("sheet on ball", "penalty")]
+ONE_ITERATION = [
+    ("crossing rods", "penalty"),
+    ("rod on spinning ball", "barrier"),
+    ("rod on spinning capsule", "penalty"),
+]
+ONE_ITERATION += [("rod on moved mesh", "penalty"), ("sheets", "barrier")]
 
 
 def differentiated(name: str, law: str, steps: int, speed: float = 0.0, coefficients=None, **contact):
@@ -71,15 +79,13 @@ def number_shifts(model, inputs: list, names: tuple) -> list[Shift]:
     return shifts
 
 
-@covering(1, name=SCENES, law=("barrier", "penalty"))
+@chosen(WITHOUT_FRICTION, name=SCENES, law=LAWS)
 def test_a_step_by_its_state_and_numbers(name, law):
     model, gradient, inputs, difference = differentiated(name, law, 1)
     check_state(model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "range", "radius")))
 
 
-@each_law
-@pytest.mark.parametrize("form", ["logistic", pytest.param("polynomial", marks=pytest.mark.slow)])
-@each_scene
+@chosen([(*case, "logistic") for case in ONE_ITERATION], name=SCENES, law=LAWS, form=("logistic", "polynomial"))
 def test_a_step_with_friction(name, law, form):
     model, gradient, inputs, difference = differentiated(name, law, 1, SLIDING, friction_law=form, **WITH_FRICTION)
     check_state(
@@ -99,7 +105,17 @@ def test_friction_with_several_lag_iterations(name, friction_iterations):
     )
 
 
-@covering(1, name=[name for name in SCENES if not name.startswith("sheet")], friction_iterations=(1, 2))
+@chosen(
+    [
+        ("crossing rods", 1),
+        ("parallel rods", 2),
+        ("rod on plane", 2),
+        ("rod on moved mesh", 1),
+        ("rod on spinning ball", 2),
+    ],
+    name=[name for name in SCENES if not name.startswith("sheet")],
+    friction_iterations=(1, 2),
+)
 def test_friction_with_rolling_contact(name, friction_iterations):
     """Rolling adds derivatives by twist angles, edge directions and radii."""
     model, gradient, inputs, difference = differentiated(
@@ -110,8 +126,7 @@ def test_friction_with_rolling_contact(name, friction_iterations):
     )
 
 
-@pytest.mark.parametrize("friction_iterations", [2, 3])
-@pytest.mark.parametrize("name", ["crossing rods", "sheet on ball"])
+@covering(1, name=("crossing rods", "sheet on ball"), friction_iterations=(2, 3))
 def test_gradients_need_the_derivative_by_lagged_quantities(name, friction_iterations, monkeypatch):
     """Dropping the derivative by lagged quantities changes gradients by over a tenth of their largest entry."""
 
@@ -133,11 +148,12 @@ def test_gradients_need_the_derivative_by_lagged_quantities(name, friction_itera
 
 
 @covering(
+    1,
     name=("rod on plane", "rod on ball", "rod on capsule", "rod on mesh"),
     speed=(SLIDING, -SLIDING),
     friction_iterations=(1, 2),
+    coefficients=((0.2, 0.6, 0.4), (0.0, 0.5, 0.3)),
 )
-@pytest.mark.parametrize("coefficients", [(0.2, 0.6, 0.4), pytest.param((0.0, 0.5, 0.3), marks=pytest.mark.slow)])
 def test_friction_by_direction(name, speed, coefficients, friction_iterations):
     """Anisotropic friction of a rod that slides forwards and backwards, with directions of edges or across nodes."""
     model, gradient, inputs, difference = differentiated(
@@ -146,7 +162,11 @@ def test_friction_by_direction(name, speed, coefficients, friction_iterations):
     check_state(model, gradient, difference, *number_shifts(model, inputs, ("radius", "friction")))
 
 
-@covering(1, name=("crossing rods", "rod on ball", "rod on mesh", "sheets"), law=("barrier", "penalty"))
+@chosen(
+    [("crossing rods", "barrier"), ("sheets", "penalty")],
+    name=("crossing rods", "rod on ball", "rod on mesh", "sheets"),
+    law=LAWS,
+)
 def test_eight_steps_of_sliding(name, law):
     model, gradient, inputs, difference = differentiated(name, law, 8, SLIDING, **WITH_FRICTION)
     check_state(model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "radius", "friction")))
@@ -159,8 +179,7 @@ def test_sticking_contacts_creep(name):
     check_state(model, gradient, difference, *number_shifts(model, inputs, ("friction",)))
 
 
-@lagged_once_or_twice
-@pytest.mark.parametrize("name", ["crossing rods", "rod on sheet"])
+@covering(1, name=("crossing rods", "rod on sheet"), friction_iterations=(1, 2))
 def test_a_step_by_its_length(name, friction_iterations):
     _, _, (inputs,), difference = differentiated(
         name, "penalty", 1, SLIDING, friction_iterations=friction_iterations, **WITH_FRICTION

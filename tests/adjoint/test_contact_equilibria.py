@@ -15,9 +15,8 @@ from tests.adjoint.contact_cases import MESH, RADIUS, RANGE, bar, rod, sheet
 from tests.adjoint.differences import built, check, cotangent, parameter_shifts
 from tests.adjoint.test_contact_adjoint import number_shifts
 from tests.adjoint.test_equilibrium_adjoint import RTOL, check_load, difference_of, position_weights
-from tests.pairwise import covering
+from tests.pairwise import chosen, covering
 
-slow = pytest.mark.slow
 WAY = np.linspace(-0.05, 0.05, 7)
 
 
@@ -104,15 +103,7 @@ def equilibrium_with_friction(name: str, law: str, velocity: float, **contact):
     return model, state, inputs, difference_of(model, model.state(), weights)
 
 
-@pytest.mark.parametrize(
-    ("velocity", "law"),
-    [
-        (1e-2, "barrier"),
-        (1e-4, "penalty"),
-        *(pytest.param(*case, marks=slow) for case in ((1e-2, "penalty"), (1e-4, "barrier"))),
-    ],
-)
-@pytest.mark.parametrize("name", CASES)
+@covering(1, name=CASES, velocity=(1e-2, 1e-4), law=("barrier", "penalty"))
 def test_an_equilibrium_with_friction(name, velocity, law):
     """Contacts creep at the larger stick threshold and slip at the smaller one."""
     model, state, inputs, difference = equilibrium_with_friction(name, law, velocity)
@@ -124,8 +115,10 @@ def test_an_equilibrium_with_friction(name, velocity, law):
     check_load(model.coupled.host, place, inputs[-1].load.numpy()[place], difference)
 
 
-@pytest.mark.parametrize(
-    ("name", "velocity"), [("plane", 1e-4), ("mesh", 1e-3), ("crossing rods", 1e-2), ("crossing rods", 1e-3)]
+@chosen(
+    [("mesh", 1e-3), ("crossing rods", 1e-2)],
+    name=("plane", "mesh", "crossing rods"),
+    velocity=(1e-4, 1e-3, 1e-2),
 )
 def test_an_equilibrium_with_rolling_contact(name, velocity):
     """Edges rotate along a path in space, so that frames differ from a single parallel transport."""
@@ -133,7 +126,7 @@ def test_an_equilibrium_with_rolling_contact(name, velocity):
     check(difference, number_shifts(model, [inputs], ("stiffness", "range", "radius", "friction")))
 
 
-@pytest.mark.parametrize("name", ["plane", "ball"])
+@chosen(["ball"], name=("plane", "ball"))
 def test_an_equilibrium_with_anisotropic_friction(name):
     model, _, inputs, difference = equilibrium_with_friction(name, "barrier", 1e-4, coefficients=(0.2, 0.5, 0.3))
     check(difference, number_shifts(model, [inputs], ("stiffness", "radius", "friction")))
@@ -171,9 +164,7 @@ GRIPPED = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=slow if name in ("rolling", "rotated ball") else ()) for name in GRIPPED]
-)
+@chosen(["plane"], name=GRIPPED)
 def test_gradients_go_through_all_load_steps(name):
     """Gradients by final poses, of which each load step takes a fraction, by forces, and by contact parameters."""
     torch = pytest.importorskip("torch")
@@ -200,7 +191,7 @@ def test_gradients_go_through_all_load_steps(name):
     check_along(loss, inputs, sizes | {"poses": 1e-5, "forces": 1e-6})
 
 
-@pytest.mark.parametrize("name", ["plane", "rolling"])
+@chosen(["plane"], name=("plane", "rolling"))
 def test_equilibria_are_those_of_a_new_solver(name):
     """Bit for bit, whatever was solved for before: under other poses, by other numbers and options, and where that failed."""
     torch = pytest.importorskip("torch")

@@ -18,6 +18,7 @@ from ddg_warp.torch import Simulator
 from tests.adjoint import differences
 from tests.adjoint.differences import TIGHT, built, cotangent, directions, entries, moving_state
 from tests.adjoint.test_adjoint import DT, SCENES, SOFT
+from tests.pairwise import chosen, covering
 from tests.torch.test_torch import STIFFNESS
 
 RATE = 1.0 / DT
@@ -158,8 +159,11 @@ def vjp_of_step(model, state, scheme: str, weights: dict, **how):
     return values | {f"parameters {i}": rows.numpy() for i, rows in enumerate(inputs[-1].parameters)}
 
 
-@pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
-@pytest.mark.parametrize("name", ["sheet", "stiffened", "moving_joined", "sand, joined", "pressure"])
+@covering(
+    1,
+    name=("sheet", "stiffened", "moving_joined", "sand, joined", "pressure"),
+    scheme=("implicit_euler", "implicit_midpoint"),
+)
 def test_gradients_are_those_of_factors(name, scheme):
     """The whole reverse of a step, by either; and bit by bit once more."""
     model = built(SCENES[name]())
@@ -204,8 +208,7 @@ def test_unconverged_worlds_of_torch_are_reported(truncated_solver):
     assert torch.isnan(torch.autograd.grad((after.positions**2).sum(), velocities)[0]).any()
 
 
-@pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
-@pytest.mark.parametrize("name", ["joined", "sheet"])
+@covering(1, name=("joined", "sheet"), scheme=("implicit_euler", "implicit_midpoint"))
 def test_coupled_adjoint_solves_are_replayed(name, scheme):
     """One captured graph serves all steps of a length, with the results of single launches."""
     gradients = []
@@ -221,7 +224,7 @@ def test_coupled_adjoint_solves_are_replayed(name, scheme):
     np.testing.assert_array_equal(*gradients)
 
 
-@pytest.mark.parametrize("name", ["joined", "sheet"])
+@chosen(["sheet"], name=("joined", "sheet"))
 def test_mixed_precision(name):
     """Gradients agree with float64 within 1e-4, as the adjoint is solved in float64."""
     gradients = []

@@ -11,6 +11,7 @@ from tests.adjoint.test_adjoint import CURVE, DT, SCENES, SOFT, T, a_scene
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import RodParameters, ShellParameters, Simulator, gradient_check_scenes  # noqa: E402
+from tests.pairwise import covering  # noqa: E402
 from tests.torch.test_torch import check, normal  # noqa: E402
 
 SECTIONS = {
@@ -67,8 +68,7 @@ def simulator(scene: ddg.Scene, scheme: str = "implicit_midpoint") -> Simulator:
     return Simulator(built(scene), DT, scheme=scheme, **TIGHT)
 
 
-@pytest.mark.parametrize("statics", [False, True])
-@pytest.mark.parametrize("name", OBJECTS)
+@covering(1, name=OBJECTS, statics=(False, True))
 def test_density_and_radius_are_those_that_rods_are_built_with(name, statics):
     sim = simulator(scene_of(name))
     factors = RodParameters(sim, names=("density", "radius"))
@@ -97,16 +97,10 @@ def test_masses_of_every_world():
             assert float((result[2] - result[0]).abs().max()) > 1e-4
 
 
-@pytest.mark.parametrize(
-    ("name", "analysis"),
-    [(n, s) for n in ("twisted", "closed", "joined", "sheet") for s in ("implicit_euler", "implicit_midpoint")]
-    + [(n, "statics") for n in ("clamped_end", "joined", "sheet")]
-    + [
-        ("planar", "implicit_euler"),
-        ("planar", "statics"),
-        ("stiffened", "implicit_midpoint"),
-        ("stiffened", "statics"),
-    ],
+@covering(
+    1,
+    name=("twisted", "closed", "joined", "sheet", "planar", "stiffened"),
+    analysis=("implicit_euler", "implicit_midpoint", "statics"),
 )
 def test_masses_under_gravity_of_every_world(name, analysis):
     """Gradients by every kind of mass use the gravity of their world."""
@@ -230,8 +224,7 @@ def test_invalid_values_are_refused(parameters, match):
         sim.step(sim.initial_state(), parameters)
 
 
-@pytest.mark.parametrize("scheme", ["implicit_euler", "implicit_midpoint"])
-@pytest.mark.parametrize("factor", [1.0, 1e3, 1e6])
+@covering(1, factor=(1.0, 1e3, 1e6), scheme=("implicit_euler", "implicit_midpoint"))
 def test_mixed_precision_follows_the_given_stiffness(scheme, factor):
     """A tensor makes rods far stiffer than the model's, for which float32 suffices; a factor 1e6 selects float64."""
     names = [f"rod_bend_twist.stiffness_{k}" for k in (1, 2, 3)] + ["rod_stretch.stiffness"]

@@ -15,6 +15,7 @@ from tests.adjoint.test_adjoint import DT
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import ShellParameters, Simulator  # noqa: E402
+from tests.pairwise import covering  # noqa: E402
 from tests.torch.test_torch import check, normal  # noqa: E402
 
 NUMBERS, FORMS, MASS = ("young", "thickness", "poisson"), ("metric", "curvature"), ("density",)
@@ -109,8 +110,7 @@ def test_curvatures_and_metrics_are_those_along_the_direction():
     np.testing.assert_allclose(quantities["metric"], grown_metric(points, triangles, 1.2, 0.9, along), atol=1e-15)
 
 
-@pytest.mark.parametrize("bending", ["midedge_dof", "hinge"])
-@pytest.mark.parametrize("statics", [False, True])
+@covering(1, bending=("midedge_dof", "hinge"), statics=(False, True))
 def test_gradients(bending, statics):
     """Gradients by every quantity, in two worlds, through steps and equilibria, against differences."""
     names = (NUMBERS if bending == "hinge" else NUMBERS + FORMS) + MASS

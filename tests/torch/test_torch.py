@@ -18,7 +18,7 @@ from tests.adjoint.test_adjoint import CURVE, DT, SCENES, SOFT, a_scene
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import RodParameters, ShellParameters, Simulator  # noqa: E402
-from tests.pairwise import covering  # noqa: E402
+from tests.pairwise import chosen, covering  # noqa: E402
 
 STIFFNESS = {
     "twisted": "rod_bend_twist.stiffness_1",
@@ -274,9 +274,7 @@ def test_equilibria(name):
     check(loss, {"stiffness": values}, {"stiffness": 1e-2 * float(values.max())})
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name in ("twisted", "sheet") else ()) for name in STIFFNESS]
-)
+@chosen(["planar"], name=STIFFNESS)
 def test_equilibria_are_those_of_a_new_simulator(name):
     """Bit for bit, by each parameter that is not zero, after one by other values of it."""
     sim = resting(name)
@@ -485,13 +483,13 @@ def test_invalid_inputs_are_refused(parameters, controls, message):
         sim.step(sim.initial_state(2), parameters, controls)
 
 
-@pytest.mark.parametrize("solver", ["sweep", "partitioned"])
-@pytest.mark.parametrize(("young", "radius", "passes"), [(1e7, 0.02, 1), (1e9, 0.02, 2), (1e11, 0.002, 0)])
-def test_float32_solves_for_the_noninertial_gradient(monkeypatch, young, radius, passes, solver):
+@covering(1, solver=("sweep", "partitioned"), case=((1e7, 0.02, 1), (1e9, 0.02, 2), (1e11, 0.002, 0)))
+def test_float32_solves_for_the_noninertial_gradient(monkeypatch, case, solver):
     """Gradients agree within the error of the solutions.
 
     Alternative: float32 solutions for w itself, dt times the gradients by velocities, leave errors of 1e-4.
     """
+    young, radius, passes = case
     monkeypatch.setattr(linear_solve, "automatic", lambda group: solver)
     scene, points = ddg.Scene(gravity=(0.0, 0.0, -9.81)), np.zeros((24, 3))
     points[:, 0] = np.linspace(0.0, 1.0, len(points))
@@ -513,7 +511,7 @@ def test_float32_solves_for_the_noninertial_gradient(monkeypatch, young, radius,
     assert np.linalg.norm(result - exact) < (10.0 * bound if passes else 1e-6) * np.linalg.norm(exact)
 
 
-@pytest.mark.parametrize("name", ["twisted", "joined", "planar", "sheet"])
+@chosen(["twisted", "sheet"], name=("twisted", "joined", "planar", "sheet"))
 def test_mixed_precision_is_close_to_float64(name):
     """Gradients agree with float64 within 1e-4, by float32 solutions where these suffice."""
     gradients = []

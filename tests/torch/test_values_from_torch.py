@@ -16,6 +16,7 @@ from tests.adjoint import differences
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import Simulator, WorldState  # noqa: E402
+from tests.pairwise import covering  # noqa: E402
 
 REAL = torch.float64
 INVALID = {"nan": float("nan"), "inf": float("inf"), "negative": -1.0}
@@ -35,8 +36,7 @@ def gripped(worlds: int = 1, nodes: int = 9, dt: float = 0.02) -> Simulator:
 
 
 # --- values that parameters may not have ---
-@pytest.mark.parametrize("value", INVALID)
-@pytest.mark.parametrize("name", ["rod", "rods joined rigidly", "shell, hinge", "rod with drag", "rods in contact"])
+@covering(1, name=("rod", "rods joined rigidly", "shell, hinge", "rod with drag", "rods in contact"), value=INVALID)
 def test_a_value_that_is_refused_takes_its_world_out_of_the_step(name, value):
     """Invalid values of any parameter fail the second of three worlds with NaN and a named reason.
 
