@@ -13,11 +13,7 @@ from ddg_warp.torch.gradient_check_scenes import OBJECTS, scene_of
 WORLDS, DT = 2, 2e-3
 FAST = (
     "rod",
-    "rod without twist",
-    "planar rod",
-    "closed rod",
     "rod with drag",
-    "ribbon",
     "rods joined rigidly",
     "shell, hinge",
     "rod on a shell",

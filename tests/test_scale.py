@@ -14,6 +14,7 @@ from ddg_warp.geometry import meshes
 from ddg_warp.solve.equilibrium.continuation import Continuation
 from ddg_warp.solve.equilibrium.stability import spectrum
 from ddg_warp.solve.equilibrium.statics import solve
+from tests.pairwise import covering
 
 MATERIAL = ddg.Material(1e6, 0.3, density=1000.0)
 LENGTHS = [1e-9, pytest.param(1e-3, marks=pytest.mark.slow), 1e5]
@@ -116,9 +117,7 @@ def answers(name: str, length: float, precision: str, device: str) -> dict:
     return result | {"steps": state.points() / length}
 
 
-@pytest.mark.parametrize("precision", ["float64", "mixed"])
-@pytest.mark.parametrize("length", LENGTHS)
-@pytest.mark.parametrize("name", OBJECTS)
+@covering(1, name=OBJECTS, length=LENGTHS, precision=("float64", "mixed"))
 def test_scale(device, name, length, precision):
     results, expected = (answers(name, each, precision, str(device)) for each in (length, 1.0))
     assert np.abs(expected["equilibrium"] - OBJECTS[name](1.0).build("cpu").state().points()).max() > 1e-3

@@ -104,6 +104,12 @@ LONG = (
     "morphing_bilayer",
     "policy",
     "residual_network",
+    "identify_from_recording",
+    "inverse_rest_shape",
+    "magnetic_shape",
+    "overhand_knot",
+    "plectoneme",
+    "soft_gripper",
 )
 LEARNED = (
     "identify_from_recording",

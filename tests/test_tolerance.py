@@ -16,6 +16,7 @@ from ddg_warp.compile.residual_tolerance import FAN, outer_forces
 from ddg_warp.geometry import meshes
 from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
+from tests.pairwise import chosen
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 import bench_rods
@@ -42,8 +43,7 @@ def test_error_of_uncoupled_and_coupled_rods(device, rtol):
     assert 1e-12 < max(position_errors) < 10.0 * rtol * fall
 
 
-@pytest.mark.parametrize("nodes", [121, pytest.param(961, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("island", [False, True], ids=["alone", "island"])
+@chosen([(True, 121)], island=(False, True), nodes=(121, 961))
 def test_long_rods_of_many_nodes(device, island, nodes):
     """Rods of 1 cm edges are off by less than rtol times length after 64 steps, and by less for smaller rtol."""
     case = bench_rods.Case(

@@ -11,6 +11,7 @@ from scipy import linalg
 import ddg_warp as ddg
 from ddg_warp.scenes import flying_beam, hanging_chain, spinning_rod, vibration, whirling
 from ddg_warp.solve.equilibrium.tangent import Tangent
+from tests.pairwise import chosen
 
 slow = pytest.mark.slow
 
@@ -139,7 +140,7 @@ def test_one_step_map_of_a_mode(scheme, angle, device):
 
 # Spinning rod: EA r'' + rho A W^2 r = 0, r' = 1 at the ends; length / L = tan(k / 2) / (k / 2).
 LENGTH_RATIO = {0.1: 1.000834168, 0.5: 1.021367685, 1.0: 1.09260498}
-SPINS = [pytest.param(0.1, marks=pytest.mark.slow), 0.5, 1.0]
+SPINS = (0.1, 0.5, 1.0)
 
 
 def polygon(k: float, n: int) -> np.ndarray:
@@ -172,7 +173,7 @@ def spin(k: float, n: int, steps: int, device: str) -> dict[str, np.ndarray]:
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
-@pytest.mark.parametrize("k", SPINS)
+@chosen([0.5], k=SPINS)
 def test_spinning_rod_conserves_length_momenta_and_energy(k, device):
     steps, changes = (200, 400, 800), []
     for count in steps:
@@ -189,7 +190,7 @@ def test_spinning_rod_conserves_length_momenta_and_energy(k, device):
     assert abs(fitted_order(1.0 / np.array(steps), changes) - 2.0) < 0.1
 
 
-@pytest.mark.parametrize("k", SPINS)
+@chosen([1.0], k=SPINS)
 def test_spinning_rod_has_the_exact_length(k, device):
     edges, errors = (16, 32, 64), []
     for n in edges:

@@ -25,7 +25,9 @@ def test_ashwell_has_timoshenko_and_the_plate_as_limits():
     assert errors[0] / errors[1] == pytest.approx(2.0, abs=0.02)
 
 
-@pytest.mark.parametrize(("mesh", "cells"), [("right", 2), ("right", 4), ("jittered", 4)])
+@pytest.mark.parametrize(
+    ("mesh", "cells"), [("right", 2), pytest.param("right", 4, marks=pytest.mark.slow), ("jittered", 4)]
+)
 def test_narrow_strip_has_timoshenko_curvature(device, mesh, cells):
     """kappa W^2 / h = 0.15."""
     assert curvature(device, 0.02, cells, mesh) == pytest.approx(KAPPA, rel=2e-3)

@@ -15,8 +15,8 @@ from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
     ("turns", "edges", "x", "z"),
     [
         (0.25, (40, 80, 160), 0.6366197724, 0.6366197724),
-        (0.5, (60, 120, 240), 0.0, 0.6366197724),
-        (1.0, (100, 200, 400), 0.0, 0.0),
+        pytest.param(0.5, (60, 120, 240), 0.0, 0.6366197724, marks=pytest.mark.slow),
+        pytest.param(1.0, (100, 200, 400), 0.0, 0.0, marks=pytest.mark.slow),
         pytest.param(2.0, (200, 400, 800), 0.0, 0.0, marks=pytest.mark.slow),
     ],
 )
@@ -51,8 +51,8 @@ def test_roll_up_in_space_is_planar(device):
 @pytest.mark.parametrize(
     ("load", "x", "drop", "angle"),
     [
-        (1.0, 0.9435667637, 0.3017207738, 0.4613519497),
-        (5.0, 0.6123716393, 0.7137915236, 1.215368118),
+        pytest.param(1.0, 0.9435667637, 0.3017207738, 0.4613519497, marks=pytest.mark.slow),
+        pytest.param(5.0, 0.6123716393, 0.7137915236, 1.215368118, marks=pytest.mark.slow),
         (10.0, 0.4450044022, 0.8106090249, 1.430285539),
     ],
 )
@@ -73,8 +73,8 @@ def test_tip_load_matches_elastica(device, load, x, drop, angle):
 @pytest.mark.parametrize(
     ("weight", "axial", "edges", "x", "drop", "angle"),
     [
-        (0.1, 1e8, (20, 40, 80), 0.9999107322, 0.01249843785, 0.01666508519),
-        (1.0, 1e8, (25, 50, 100), 0.9912463953, 0.123471402, 0.1651155605),
+        pytest.param(0.1, 1e8, (20, 40, 80), 0.9999107322, 0.01249843785, 0.01666508519, marks=pytest.mark.slow),
+        pytest.param(1.0, 1e8, (25, 50, 100), 0.9912463953, 0.123471402, 0.1651155605, marks=pytest.mark.slow),
         (10.0, 1e8, (50, 100, 200), 0.6563537612, 0.7001997155, 1.052643117),
         (100.0, 1e8, (100, 200, 400), 0.1592233826, 0.9375239354, 1.564107321),
         pytest.param(1000.0, 1e9, (400, 800, 1600), 0.04598645476, 0.9811412693, 1.570796322, marks=pytest.mark.slow),
@@ -125,9 +125,9 @@ def test_post_buckling_matches_elastica(device, shortening, load, amplitude, ang
 @pytest.mark.parametrize(
     ("first", "last", "load"),
     [
-        ("pinned", "pinned", 9.869604401),
+        pytest.param("pinned", "pinned", 9.869604401, marks=pytest.mark.slow),
         ("clamped", "clamped", 39.4784176),
-        ("clamped", "free", 2.4674011),
+        pytest.param("clamped", "free", 2.4674011, marks=pytest.mark.slow),
         ("clamped", "pinned", 20.19072856),
     ],
 )

@@ -13,14 +13,13 @@ from ddg_warp import statics
 from ddg_warp.geometry import meshes
 from ddg_warp.scene.equilibrium_path import Displacement, StopCriterion
 from ddg_warp.solve.equilibrium.continuation import Continuation
-from tests.pairwise import covering
+from tests.pairwise import chosen, covering
 
 LENGTH = 1.1  # m, of the bars of the truss
 HEIGHT = np.sqrt(LENGTH**2 - 1.0)  # m, of its apex
 THICK, BALL = 0.01, 0.3  # m, radii of the bars and of the ball below
 WALL, COLUMN = 0.02, 1e-3  # m, between the axis of a column and walls, and its radius
-FAST = ("barrier", 1e-2), ("penalty", 1e-6)  # laws and ranges of the fast tests of the truss
-each_law = pytest.mark.parametrize("law", ["barrier", "penalty"])
+LAWS = ("barrier", "penalty")
 
 
 def truss(device, law: str, stop: float, reach: float, stiffness: float):
@@ -55,17 +54,10 @@ def upward_force(model, state) -> float:
     return float(sum(reaction.force[2] for reaction in model.reactions(state)[-obstacles:]))
 
 
-@pytest.mark.parametrize(
-    ("law", "reach", "stiffness"),
-    [
-        pytest.param(law, reach, stiffness, marks=() if (law, reach) in FAST else pytest.mark.slow)
-        for law in ("barrier", "penalty")
-        for reach, stiffness in ((1e-2, 10.0), (1e-4, 1e3), (1e-6, 1e5))
-    ],
-)
-def test_truss_snaps_onto_a_stop(device, law, reach, stiffness):
+@chosen([("barrier", (1e-2, 10.0))], law=LAWS, contact=((1e-2, 10.0), (1e-4, 1e3), (1e-6, 1e5)))
+def test_truss_snaps_onto_a_stop(device, law, contact):
     """The load falls until bars and ball are in contact, then grows with the force of the ball. The way back is the same."""
-    stop = -0.1
+    stop, (reach, stiffness) = -0.1, contact
     follower = truss(device, law, stop, reach, stiffness)
     path = follower.trace(stop=StopCriterion(load=(-1.0, 0.3)))
     assert path.outcome == "load"
@@ -84,7 +76,7 @@ def test_truss_snaps_onto_a_stop(device, law, reach, stiffness):
     assert truss_load(HEIGHT - back.values("drop")[-1]) == pytest.approx(-0.1, rel=1e-9)
 
 
-@each_law
+@chosen(["penalty"], law=LAWS)
 def test_truss_on_a_ball_bifurcates_sideways(device, law):
     """The apex slides off where the contact force is the lateral stiffness times the distance of the centres.
 
@@ -117,7 +109,7 @@ def column(device, law: str, n: int):
     return Continuation(scene.build(device, "float64"), {"rise": Displacement.of(n // 2, "z")}, load_scale=10.0)
 
 
-@each_law
+@chosen(["barrier"], law=LAWS)
 def test_buckled_column_between_walls_matches_its_closed_form(device, law):
     """The column buckles at pi^2 EI / L^2 until the middle meets a wall, which exerts a force R.
 
@@ -238,7 +230,7 @@ def scene_of(name: str, law: str, friction: float = 0.0) -> ddg.Scene:
     return scene
 
 
-@covering(1, name=KINDS, law=("barrier", "penalty"))
+@covering(1, name=KINDS, law=LAWS)
 def test_paths_end_at_the_states_of_load_steps(device, name, law):
     """Weight and obstacle motions follow the load parameter: end states and reactions are the same."""
     model = scene_of(name, law).build(device, "float64")

@@ -19,10 +19,12 @@ from ddg_warp.solve.equilibrium.tangent import Tangent
 from tests.adjoint.contact_cases import SCENES, scene_of, touching
 from tests.adjoint.differences import built
 from tests.collision.brute_force import edge_edge
+from tests.pairwise import covering
 
 RUBBER = ddg.Material(young=1e7, density=1000.0, poisson=0.5)
 G = 9.81  # m/s^2
-each_law = pytest.mark.parametrize("law", ["barrier", "penalty"])
+LAWS = ("barrier", "penalty")
+each_law = pytest.mark.parametrize("law", LAWS)
 
 
 def line(start, end, n: int) -> np.ndarray:
@@ -55,8 +57,7 @@ def beam_under_a_ball(n: int, law: str, position: float, both: bool):
     return scene
 
 
-@each_law
-@pytest.mark.parametrize("load_steps", [1, 3])
+@covering(1, load_steps=(1, 3), law=LAWS)
 def test_crossed_beams_are_springs(device, law, load_steps):
     """Two springs of 192 EI / L^3 act in series: each takes half of the overlap, and the force is 96 EI / L^3 times the overlap."""
     scene = crossed_beams.build(law=law, dt=1.0 / crossed_beams.SPEED_UP)  # clamps are down at load parameter 1
@@ -73,11 +74,10 @@ def test_crossed_beams_are_springs(device, law, load_steps):
         assert (contacts.gap > 0.0).all()
 
 
-@each_law
-@pytest.mark.parametrize(("position", "both", "spring"), [(0.5, True, 192.0), (1.0, False, 3.0)])
-def test_ball_on_a_beam_matches_euler_bernoulli(device, law, position, both, spring):
+@covering(1, beam=((0.5, True, 192.0), (1.0, False, 3.0)), law=LAWS)
+def test_ball_on_a_beam_matches_euler_bernoulli(device, law, beam):
     """F = 192 EI w / L^3 in the middle of a clamped beam, 3 EI w / L^3 at the tip of a cantilever (Euler and Bernoulli)."""
-    errors = []
+    (position, both, spring), errors = beam, []
     for n in (16, 32, 64):
         scene = beam_under_a_ball(n, law, position, both)
         model = scene.build(device, precision="float64")
@@ -205,8 +205,7 @@ def least_height(lower: np.ndarray, upper: np.ndarray) -> float:
     return min(heights)
 
 
-@each_law
-@pytest.mark.parametrize("both", [True, False])
+@covering(1, both=(True, False), law=LAWS)
 def test_large_load_steps_never_cross_rods(device, law, both):
     """Clamps move 0.25 m beyond a beam in one load step and in ten: the rods never cross, and both end alike."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
@@ -248,8 +247,7 @@ def test_worlds_equal_single_world_equilibria(device):
         np.testing.assert_allclose(state.points()[world], expected.points(), atol=1e-9)
 
 
-@each_law
-@pytest.mark.parametrize("name", SCENES)
+@covering(1, name=SCENES, law=LAWS)
 def test_contact_tangent_equals_differences(name, law):
     """Products equal central differences of forces along a direction that moves all free dofs."""
     model = built(scene_of(name, law))

@@ -11,6 +11,7 @@ from ddg_warp.errors import SolverError
 from ddg_warp.geometry import meshes
 from ddg_warp.scenes import capstan
 from ddg_warp.solve.equilibrium.statics import Equilibrium
+from tests.pairwise import chosen, covering
 
 RUBBER = ddg.Material(young=1e7, density=1000.0, poisson=0.5)
 G = 9.81  # m/s^2
@@ -63,8 +64,7 @@ CREEP = {  # speed over nu at which the law has a fraction s of the friction
 }
 
 
-@pytest.mark.parametrize("law", CREEP)
-@pytest.mark.parametrize("name", AT_REST)
+@covering(1, name=AT_REST, law=CREEP)
 def test_bodies_on_a_slope_creep_by_the_friction_law(device, name, law):
     """Friction is tan(angle) / mu of the limit everywhere: all nodes creep at one speed, with the load increments as time."""
     mu, angle = 0.5, 0.3
@@ -253,7 +253,7 @@ def test_band_brake_tension_and_moment(device, sense):
     np.testing.assert_allclose(drum.moment[1], sense * abs(tension - 5.0 * slack) * capstan.DRUM, rtol=5e-3)
 
 
-@pytest.mark.parametrize("load_steps", [1, 3])
+@chosen([1], load_steps=(1, 3))
 def test_wall_slides_a_rod_by_mu_times_weight(device, load_steps):
     """A wall moves a rod along the floor over many ranges of contact, by mu of the weight."""
     scene = ddg.Scene(gravity=(0.0, 0.0, -G))
@@ -319,6 +319,10 @@ def test_bracket_locks_beyond_its_critical_distance(device):
     state = statics.solve(model)
     contacts = model.contacts(state)
     np.testing.assert_allclose((contacts.force + contacts.friction)[:, 2].sum(), -1.0, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_bracket_slides_within_its_critical_distance(device):
     with pytest.raises(SolverError, match="sliding bodies may have no equilibrium"):
         statics.solve(bracket(0.97).build(device, precision="float64"), max_cuts=1)
 
@@ -342,7 +346,8 @@ def test_relaxation_ends_in_no_overlap(device):
         np.testing.assert_allclose(state.coupled.q.numpy()[5:10, 2] - begun[5:10, 2], expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), 1])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_pile_at_rest_is_in_equilibrium(device, seed):
     """A pile at rest in steps, by friction alone, moves in an equilibrium as far as the creep of that time."""
     rng, rods = np.random.default_rng(seed), 12

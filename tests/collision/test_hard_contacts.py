@@ -22,10 +22,10 @@ from hard_cases import (
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
+from tests.pairwise import covering
 
 
-@pytest.mark.parametrize("law", ["barrier", "penalty"])
-@pytest.mark.parametrize("pull", [0.2, 0.6])
+@covering(1, law=("barrier", "penalty"), pull=(0.2, 0.6))
 def test_rod_in_the_groove_of_two_parallel_rods(device, pull, law):
     """Three rods are parallel; both normal forces are N / 2 = W / (2 cos a), and friction is at most mu N.
 
@@ -211,8 +211,7 @@ def test_fast_rod_passes_obstacles_beyond_range_unslowed(device):
     assert integrator.statistics()["contact"]["contacts"] == {"mean": 0.0, "last": 0}
 
 
-@pytest.mark.parametrize("ratio", [1e-3, 1.0, 1e4])
-@pytest.mark.parametrize("young", [1e4, 1e6, 1e9])
+@covering(1, ratio=(1e-3, 1.0, 1e4), young=(1e4, 1e9, 1e6))
 def test_collisions_at_any_stiffness_ratio_lose_energy(device, ratio, young):
     """Contact stiffness over m / dt^2 and Young's modulus vary: colliding rods bounce and only lose energy."""
     dt = 1e-3

@@ -9,6 +9,7 @@ import ddg_warp as ddg
 from ddg_warp import statics
 from ddg_warp.errors import SceneError
 from ddg_warp.scenes import capstan
+from tests.pairwise import covering
 
 RADIUS, G = 2e-3, 9.81
 STIFF = ddg.Material(young=1e7, density=1000.0, poisson=0.4)
@@ -31,13 +32,13 @@ def run(model, steps: int, dt: float = 1e-3, state=None, **options):
     return state
 
 
-@pytest.mark.parametrize(("slope", "mu"), [(0.3, 0.5), (0.3, 0.2), (0.5, 0.1), (0.5, 0.15)])
-@pytest.mark.parametrize("mesh", [False, True])
-def test_cylinder_rolls_or_slides_down_a_slope(device, slope, mu, mesh):
+@covering(1, case=((0.3, 0.5), (0.3, 0.2), (0.5, 0.1), (0.5, 0.15)), mesh=(False, True))
+def test_cylinder_rolls_or_slides_down_a_slope(device, case, mesh):
     """A cylinder, I = m r^2 / 2, rolls with 2/3 g sin while tan(slope) <= 3 mu.
 
     Else it slides with g (sin - mu cos), and friction spins it up by 2 mu g cos / r.
     """
+    slope, mu = case
     normal, down = np.array([np.sin(slope), 0.0, np.cos(slope)]), np.array([np.cos(slope), 0.0, -np.sin(slope)])
     scene = ddg.Scene()
     rod(scene, ALONG_Y + 1.48 * RADIUS * normal)
@@ -158,16 +159,15 @@ def logs(between: float, floor: float) -> ddg.Scene:
     return scene
 
 
-@pytest.mark.parametrize(("statically", "near"), [(True, 0.01), (False, 0.02)])
-@pytest.mark.parametrize("floor", [False, True])
-def test_log_pile_stands_above_the_critical_friction(device, statically, near, floor):
+@covering(1, case=((True, 0.01), (False, 0.02)), floor=(True, False))
+def test_log_pile_stands_above_the_critical_friction(device, case, floor):
     """The pile stands for friction of at least 2 - sqrt(3) between logs, and a third of that on the floor; else the upper log
     separates the others.
 
     A lower log's moments about the axis and about the floor contact need the same friction at both contacts. The normal forces are W
     / 2 / (cos 30 + sin 30 tan 15) from above and 3 W / 2 from below.
     """
-    least = (2.0 - np.sqrt(3.0)) / (3.0 if floor else 1.0)
+    (statically, near), least = case, (2.0 - np.sqrt(3.0)) / (3.0 if floor else 1.0)
     for mu in (least * (1.0 - near), least * (1.0 + near)):
         model = logs(*((0.5, mu) if floor else (mu, 0.5))).build(device, precision="float64")
         state = statics.solve(model) if statically else run(model, 600)

@@ -30,7 +30,7 @@ def random_displacements(shapes: CollisionMesh, rng, size: float, kind: str) -> 
     return size * move
 
 
-@covering(dtype=(wp.vec3d, wp.vec3f), size=(0.01, 0.5), kind=("node", "object", "world"))
+@covering(1, dtype=(wp.vec3d, wp.vec3f), size=(0.01, 0.5), kind=("node", "object", "world"))
 def test_limited_motions_close_no_gap_and_never_cross(device, kind, size, dtype):
     """Three motions follow each other, each once to fifty times the margin."""
     shapes, points = tangle(5)
@@ -64,8 +64,7 @@ def test_limited_motions_close_no_gap_and_never_cross(device, kind, size, dtype)
         assert fractions.min() < 0.1
 
 
-@pytest.mark.parametrize("name", ["edges", "point and triangle"])
-@pytest.mark.parametrize("kind", ["node", "object", "world"])
+@covering(1, name=("edges", "point and triangle"), kind=("node", "object", "world"))
 def test_random_pairs_stop_in_time_and_close_by(device, name, kind):
     """Random pairs, one in each of 300 worlds, are sampled densely in time: pairs without initial overlap stay separate."""
     shapes, x, move = random_pairs(name, 2, 300)

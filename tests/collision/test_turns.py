@@ -25,6 +25,7 @@ from turn_cases import (
 import ddg_warp as ddg
 from ddg_warp.kernels.forces.prescribed_motion import MAX_SUBSTEPS
 from ddg_warp.solve.collision.support_arcs import PART
+from tests.pairwise import covering
 
 WIDE = "mesh", "box", "hold", "half-space"  # these move a whole rod, which cannot rotate aside
 TURNS = 0.02, 0.05, 1 / 6, 0.3, 0.5, 0.75, 0.95, 1.0, 1.3, 2.5
@@ -99,8 +100,7 @@ def assert_swept(kind: str, turns: float, radius: float, drive: str, device) -> 
         assert (points[1] == away).all()
 
 
-@pytest.mark.parametrize("drive", ["motion", "grip"])
-@pytest.mark.parametrize("kind", KINDS)
+@covering(1, kind=KINDS, drive=("motion", "grip"))
 def test_contact_follows_arcs_not_chords(device, kind, drive):
     for turns, radius in QUICK:
         radius = radius if kind != "ball" else LAST - BALL
@@ -206,8 +206,7 @@ def test_drum_friction_does_not_depend_on_the_angle_per_step(device):
 ORBIT = LAST - BALL
 
 
-@pytest.mark.parametrize("turns", [1.0, 2.0, 7.0])
-@pytest.mark.parametrize("path", ["orbit", "swing", "vertices"])
+@covering(1, turns=(1.0, 2.0, 7.0), path=("orbit", "swing", "vertices"))
 def test_motion_functions_are_sampled_until_arcs_are_resolved(device, path, turns):
     """A ball orbits by translation, a blade swings to and fro, and vertices orbit: all are back at the end."""
     if path == "orbit":
