@@ -96,6 +96,13 @@ FAULTS = (
         "wp.outer(unit, unit) * (across - along)",
         ("tests/kernels/test_contact_laws.py",),
     ),
+    Fault(
+        "friction: tangent along the slip as across it",
+        "kernels/densities/friction.py",
+        "scale * force(x), scale * slope_of(x), wp.normalize(u)",
+        "scale * force(x), scale * force(x), wp.normalize(u)",
+        ("tests/collision/test_friction_statics.py",),
+    ),
     # elements
     Fault(
         "parallel transport: sense of rotation",
@@ -132,6 +139,13 @@ FAULTS = (
         "real(-1.0e-4) * expected",
         "real(1.0e-4) * expected",
         ("tests/kernels/test_chain.py",),
+    ),
+    Fault(
+        "line search from sums: sign of Armijo's constant",
+        "kernels/newton/line_search.py",
+        "real(-1.0e-4) * expected",
+        "real(1.0e-4) * expected",
+        ("tests/kernels/test_line_search.py",),
     ),
     Fault(
         "edge-rotation update: mismatch spread over one edge too many",
