@@ -84,10 +84,10 @@ class Elements(Sample):
         out = [wp.zeros(s, dtype=t, device=self.device) for s, t in zip(shapes, types, strict=True)]
         islands = Islands(1, real, self.device)
         islands.drop_compression.fill_(0 if exact else 1)
-        kernel = element_path.evaluate_kernel(self.storage(real), real, real, 0 if exact and packed else None)
+        kernel = element_path.evaluate_kernel(self.storage(real), real, real, exact and packed > 0)
         results = element_path.results_type(real, real, True)()
         results.factor, results.tension, results.second, results.gradient, results.energy, results.stiffness = out
-        wp.launch(kernel, (1, count), [self.inputs(real), *islands.arrays], [results], device=self.device)
+        wp.launch(kernel, (1, count), [self.inputs(real), *islands.arrays, 0], [results], device=self.device)
         factor, tension, second, gradient, energy = (array.numpy().astype(float) for array in out[:5])
         rows = factor.reshape(n, slots, count, 3).transpose(0, 1, 3, 2).reshape(n, 3 * slots, count)
         matrix = np.einsum("mae,mbe->abe", rows, rows)

@@ -116,13 +116,13 @@ class RodSample(Sample):
         dim, window = kind.dim, kind.window
         sizes = ((kind.factor_rows,), (kind.geometric_rows,), (window,), (2,), ())
         out = [wp.zeros((*size, *shape), dtype=real, device=self.device) for size in sizes]
-        kernel = element_path.evaluate_kernel(rod_storage(kind, real), real, real, 0 if exact else None)
+        kernel = element_path.evaluate_kernel(rod_storage(kind, real), real, real, exact)
         islands, results = Islands(2, real, self.device), element_path.results_type(real, real)()
         islands.drop_compression.fill_(0 if exact else 1)
         rows = [array.reshape((*array.shape[:-2], -1)) for array in out]
         results.factor, results.second, results.gradient, results.energy, results.stiffness = rows
         results.tension = results.factor
-        inputs = [self.inputs(real), *islands.arrays]
+        inputs = [self.inputs(real), *islands.arrays, 0]
         wp.launch(kernel, shape, inputs, [results], device=self.device, block_dim=128)  # its launch bound
         rows, geometric, force, energy = (array.numpy().astype(float) for array in out[:4])
         edge_row, tension_row = kind.vertex_strains * window, kind.factor_rows - kind.tensions

@@ -369,7 +369,7 @@ def evaluate_kernel(
     storage: ElementStorage,
     real,
     linear,
-    exact_from: int | None = None,
+    curved: bool = False,
     split: bool = False,
     project: bool = False,
     reuse: bool = False,
@@ -381,8 +381,8 @@ def evaluate_kernel(
     the line search does not use. The flag `frames_outdated` is set where reference frames must be updated before the next step.
 
     Args:
-        exact_from: iteration from which second derivatives are written; with the factor, compression included, they make the exact
-            Hessian. None for a Gauss-Newton matrix.
+        curved: True if second derivatives are written, from iteration `exact_from` on; with the factor, compression included, they
+            make the exact Hessian. False for a Gauss-Newton matrix.
         split: True if rows of edges have only the stiffness that the matrix carries, and slacks are written; see
             `kernels.linear.mixed_axial_force`.
         project: True if all islands drop compression, second derivatives or not.
@@ -391,7 +391,6 @@ def evaluate_kernel(
     Inputs, Results, W = storage.Inputs, results_type(real, linear, storage.slots is not None), storage.Window
     items, last_item, count_of, clears_active = storage.items, storage.last_item, storage.count, storage.clears_active
     whole_of, read, column_of, write = storage.whole, storage.read, storage.column, write_function(storage, real, real)
-    curved, begin = exact_from is not None, exact_from or 0
     measures = [access.term.measure for access in storage.terms]
     # Alternatives: a loop over the terms, or a recursive function.
     # Measured: for wp.static(each[i]) of a loop variable Warp generates all code of a kernel whenever it is defined, compiled or not,
@@ -405,7 +404,9 @@ def evaluate_kernel(
     bounds = storage.launch_bounds(curved)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=bounds, module_options=options)
-    def evaluate(inputs: Inputs, flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), results: Results):
+    def evaluate(
+        inputs: Inputs, flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), exact_from: int, results: Results
+    ):
         i, j = wp.tid()
         island, first = items(i, j)
         if wp.static(clears_active):
@@ -416,7 +417,7 @@ def evaluate_kernel(
             return
         frozen = wp.static(reuse) and flags[ITERATION, island] > 0
         clamped = wp.static(project) or flags[DROP_COMPRESSION, island] != 0
-        exact = flags[ITERATION, island] >= wp.static(begin) and flags[DROP_COMPRESSION, island] == 0
+        exact = flags[ITERATION, island] >= exact_from and flags[DROP_COMPRESSION, island] == 0
         slot = 1 - flags[ENERGY_BUFFER, island]
         carried = scalars[MAX_EDGE_STIFFNESS, island]
         for e in range(first, last_item(first, count)):

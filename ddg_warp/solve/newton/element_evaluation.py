@@ -40,7 +40,11 @@ class ElementEvaluation:
         self.outputs = [self._allocate(*of_set) for of_set in options]
         self._kernels = [
             element_path.evaluate_kernel(
-                coupled_storage(part.term, coupled.real, not local, serial), coupled.real, linear, first, is_split
+                coupled_storage(part.term, coupled.real, not local, serial),
+                coupled.real,
+                linear,
+                first is not None,
+                is_split,
             )
             for part, first, local, is_split in options
         ]
@@ -85,7 +89,7 @@ class ElementEvaluation:
         wp.launch(
             self._kernels[index],
             (coupled.worlds, device_arrays.takers(coupled.sets[index].elements, coupled.device)),
-            [coupled.elements(state, index, q, islands.inverse_step), *islands.arrays],
+            [coupled.elements(state, index, q, islands.inverse_step), *islands.arrays, self.exact_from[index] or 0],
             [results],
             device=coupled.device,
             block_dim=128,

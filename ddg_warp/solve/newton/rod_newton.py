@@ -134,7 +134,7 @@ class RodNewton:
             rod_layout.rod_storage(kind, self.real, self.linear),
             self.real,
             self.linear,
-            self.exact_from,
+            self.exact,
             split,
             self.definite,
             self.reuse,
@@ -238,7 +238,7 @@ class RodNewton:
         wp.launch(
             self._evaluate,
             group.element_threads,
-            [group.element_inputs(self, last, self.islands.inverse_step), *self.islands.arrays],
+            [group.element_inputs(self, last, self.islands.inverse_step), *self.islands.arrays, self.exact_from or 0],
             [self._results],
             device=self.device,
             block_dim=128,
