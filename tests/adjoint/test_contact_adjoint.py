@@ -10,7 +10,7 @@ from ddg_warp.adjoint.implicit import Adjoint
 from ddg_warp.errors import SolverError
 from ddg_warp.kernels.adjoint.contact import FRICTION, RANGE, STIFFNESS
 from ddg_warp.solve.linear.exact_system import ExactSystem
-from tests.adjoint.contact_cases import DT, SCENES, scene_of, touching
+from tests.adjoint.contact_cases import DT, SCENES, law_of, scene_of, touching
 from tests.adjoint.differences import (
     TIGHT,
     Shift,
@@ -34,14 +34,8 @@ ROWS = {"stiffness": STIFFNESS, "range": RANGE, "friction": FRICTION}
 lagged_once_or_twice = pytest.mark.parametrize("friction_iterations", [pytest.param(1, marks=pytest.mark.slow), 2])
 LAWS = ("barrier", "penalty")
 # Of every kind of pairs. Friction of several iterations is checked in every scene.
-WITHOUT_FRICTION = [("parallel rods", "barrier"), ("rod on plane", "penalty"), ("rod on mesh", "barrier")]
-WITHOUT_FRICTION += [("sheet on ball", "penalty")]
-ONE_ITERATION = [
-    ("crossing rods", "penalty"),
-    ("rod on spinning ball", "barrier"),
-    ("rod on spinning capsule", "penalty"),
-]
-ONE_ITERATION += [("rod on moved mesh", "penalty"), ("sheets", "barrier")]
+WITHOUT_FRICTION = ("parallel rods", "rod on plane", "rod on mesh", "sheet on ball")
+ONE_ITERATION = ("crossing rods", "rod on spinning ball", "rod on spinning capsule", "rod on moved mesh", "sheets")
 
 
 def differentiated(name: str, law: str, steps: int, speed: float = 0.0, coefficients=None, **contact):
@@ -79,13 +73,15 @@ def number_shifts(model, inputs: list, names: tuple) -> list[Shift]:
     return shifts
 
 
-@chosen(WITHOUT_FRICTION, name=SCENES, law=LAWS)
+@chosen([(name, law_of(name)) for name in WITHOUT_FRICTION], name=SCENES, law=LAWS)
 def test_a_step_by_its_state_and_numbers(name, law):
     model, gradient, inputs, difference = differentiated(name, law, 1)
     check_state(model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "range", "radius")))
 
 
-@chosen([(*case, "logistic") for case in ONE_ITERATION], name=SCENES, law=LAWS, form=("logistic", "polynomial"))
+@chosen(
+    [(name, law_of(name), "logistic") for name in ONE_ITERATION], name=SCENES, law=LAWS, form=("logistic", "polynomial")
+)
 def test_a_step_with_friction(name, law, form):
     model, gradient, inputs, difference = differentiated(name, law, 1, SLIDING, friction_law=form, **WITH_FRICTION)
     check_state(
@@ -96,9 +92,8 @@ def test_a_step_with_friction(name, law, form):
 @covering(1, name=SCENES, friction_iterations=(2, 3))
 def test_friction_with_several_lag_iterations(name, friction_iterations):
     """Two steps of several solves each; every solve lags normal forces and tangents of the previous one."""
-    law = "penalty" if friction_iterations == 2 else "barrier"
     model, gradient, inputs, difference = differentiated(
-        name, law, 2, SLIDING, friction_iterations=friction_iterations, **WITH_FRICTION
+        name, law_of(name), 2, SLIDING, friction_iterations=friction_iterations, **WITH_FRICTION
     )
     check_state(
         model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "range", "radius", "friction"))
@@ -119,7 +114,7 @@ def test_friction_with_several_lag_iterations(name, friction_iterations):
 def test_friction_with_rolling_contact(name, friction_iterations):
     """Rolling adds derivatives by twist angles, edge directions and radii."""
     model, gradient, inputs, difference = differentiated(
-        name, "barrier", 2, SLIDING, friction_iterations=friction_iterations, rolling=True, **WITH_FRICTION
+        name, law_of(name), 2, SLIDING, friction_iterations=friction_iterations, rolling=True, **WITH_FRICTION
     )
     check_state(
         model, gradient, difference, *number_shifts(model, inputs, ("stiffness", "range", "radius", "friction"))
@@ -132,7 +127,7 @@ def test_gradients_need_the_derivative_by_lagged_quantities(name, friction_itera
 
     def gradients():
         _, gradient, inputs, _ = differentiated(
-            name, "barrier", 1, SLIDING, friction_iterations=friction_iterations, **WITH_FRICTION
+            name, law_of(name), 1, SLIDING, friction_iterations=friction_iterations, **WITH_FRICTION
         )
         return gradient.coupled.q.numpy(), by_number(inputs, "stiffness")
 
@@ -157,13 +152,13 @@ def test_gradients_need_the_derivative_by_lagged_quantities(name, friction_itera
 def test_friction_by_direction(name, speed, coefficients, friction_iterations):
     """Anisotropic friction of a rod that slides forwards and backwards, with directions of edges or across nodes."""
     model, gradient, inputs, difference = differentiated(
-        name, "barrier", 2, speed, coefficients, friction_iterations=friction_iterations, **WITH_FRICTION
+        name, law_of(name), 2, speed, coefficients, friction_iterations=friction_iterations, **WITH_FRICTION
     )
     check_state(model, gradient, difference, *number_shifts(model, inputs, ("radius", "friction")))
 
 
 @chosen(
-    [("crossing rods", "barrier"), ("sheets", "penalty")],
+    [(name, law_of(name)) for name in ("crossing rods", "sheets")],
     name=("crossing rods", "rod on ball", "rod on mesh", "sheets"),
     law=LAWS,
 )
@@ -175,14 +170,14 @@ def test_eight_steps_of_sliding(name, law):
 @pytest.mark.parametrize("name", ["parallel rods", "rod on plane"])
 def test_sticking_contacts_creep(name):
     """Sticking contacts creep well below the stick threshold, where friction is nearly linear in the slip."""
-    model, gradient, inputs, difference = differentiated(name, "barrier", 3, friction=0.8, velocity=0.5)
+    model, gradient, inputs, difference = differentiated(name, law_of(name), 3, friction=0.8, velocity=0.5)
     check_state(model, gradient, difference, *number_shifts(model, inputs, ("friction",)))
 
 
 @covering(1, name=("crossing rods", "rod on sheet"), friction_iterations=(1, 2))
 def test_a_step_by_its_length(name, friction_iterations):
     _, _, (inputs,), difference = differentiated(
-        name, "penalty", 1, SLIDING, friction_iterations=friction_iterations, **WITH_FRICTION
+        name, law_of(name), 1, SLIDING, friction_iterations=friction_iterations, **WITH_FRICTION
     )
     step_inputs = inputs[0]
     assert float(step_inputs.elements_rate[-1].numpy().sum()) != 0.0
@@ -213,7 +208,7 @@ def test_gradients_repeat_bit_by_bit(friction_iterations):
 @lagged_once_or_twice
 def test_pair_lists_regrow(friction_iterations):
     """Regrown pair lists give bitwise equal gradients."""
-    model = built(scene_of("sheets", "penalty", friction_iterations=friction_iterations, **WITH_FRICTION))
+    model = built(scene_of("sheets", friction_iterations=friction_iterations, **WITH_FRICTION))
     state = touching(model, along=SLIDING)
     results = []
     for few in (False, True):

@@ -3,6 +3,8 @@
 With friction through all load steps, by poses and forces, too, and by the closed form of a rod that is drawn along a floor.
 """
 
+from itertools import cycle
+
 import numpy as np
 import pytest
 
@@ -11,11 +13,11 @@ from ddg_warp import statics
 from ddg_warp.adjoint.implicit import EquilibriumAdjoint
 from ddg_warp.errors import SceneError, SolverError
 from tests.adjoint import differences
-from tests.adjoint.contact_cases import MESH, RADIUS, RANGE, bar, rod, sheet
+from tests.adjoint.contact_cases import MESH, RADIUS, RANGE, bar, law_of, rod, sheet
 from tests.adjoint.differences import built, check, cotangent, parameter_shifts
-from tests.adjoint.test_contact_adjoint import number_shifts
+from tests.adjoint.test_contact_adjoint import LAWS, number_shifts
 from tests.adjoint.test_equilibrium_adjoint import RTOL, check_load, difference_of, position_weights
-from tests.pairwise import chosen, covering
+from tests.pairwise import chosen
 
 WAY = np.linspace(-0.05, 0.05, 7)
 
@@ -74,7 +76,7 @@ def solved(name: str, law: str):
     return model, inputs, difference_of(model, state, weights, start=1.0)
 
 
-@covering(1, name=CASES, law=("barrier", "penalty"))
+@chosen([(name, law_of(name)) for name in CASES], name=CASES, law=LAWS)
 def test_an_equilibrium_in_contact_by_its_parameters(name, law):
     model, inputs, difference = solved(name, law)
     check(
@@ -85,7 +87,7 @@ def test_an_equilibrium_in_contact_by_its_parameters(name, law):
 
 @pytest.mark.parametrize("name", ["ball", "crossing rods"])
 def test_an_equilibrium_in_contact_by_a_load(name):
-    model, inputs, difference = solved(name, "barrier")
+    model, inputs, difference = solved(name, law_of(name))
     place = model.coupled.host.rods[-1].nodes[3]
     check_load(model.coupled.host, place, inputs[-1].load.numpy()[place], difference)
 
@@ -103,7 +105,12 @@ def equilibrium_with_friction(name: str, law: str, velocity: float, **contact):
     return model, state, inputs, difference_of(model, model.state(), weights)
 
 
-@covering(1, name=CASES, velocity=(1e-2, 1e-4), law=("barrier", "penalty"))
+@chosen(
+    [(name, velocity, law_of(name)) for name, velocity in zip(CASES, cycle((1e-2, 1e-4)), strict=False)],
+    name=CASES,
+    velocity=(1e-2, 1e-4),
+    law=LAWS,
+)
 def test_an_equilibrium_with_friction(name, velocity, law):
     """Contacts creep at the larger stick threshold and slip at the smaller one."""
     model, state, inputs, difference = equilibrium_with_friction(name, law, velocity)
@@ -128,12 +135,12 @@ def test_an_equilibrium_with_rolling_contact(name, velocity):
 
 @chosen(["ball"], name=("plane", "ball"))
 def test_an_equilibrium_with_anisotropic_friction(name):
-    model, _, inputs, difference = equilibrium_with_friction(name, "barrier", 1e-4, coefficients=(0.2, 0.5, 0.3))
+    model, _, inputs, difference = equilibrium_with_friction(name, law_of(name), 1e-4, coefficients=(0.2, 0.5, 0.3))
     check(difference, number_shifts(model, [inputs], ("stiffness", "radius", "friction")))
 
 
 def test_the_load_path_has_to_be_known():
-    model, state, _, difference = equilibrium_with_friction("plane", "barrier", 1e-3)
+    model, state, _, difference = equilibrium_with_friction("plane", law_of("plane"), 1e-3)
     state.sliding = None
     with pytest.raises(
         SceneError, match=r"contact: an equilibrium with friction depends on its load path.*statics.solve"

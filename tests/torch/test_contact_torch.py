@@ -6,7 +6,7 @@ import pytest
 import ddg_warp as ddg
 from ddg_warp.errors import SceneError
 from tests.adjoint import differences
-from tests.adjoint.contact_cases import DT, RADIUS, RANGE, SOFT, bar, scene_of, touching
+from tests.adjoint.contact_cases import DT, RADIUS, RANGE, SOFT, bar, law_of, scene_of, touching
 from tests.adjoint.differences import TIGHT
 
 torch = pytest.importorskip("torch")
@@ -18,9 +18,9 @@ from tests.torch.test_torch import check  # noqa: E402
 WITH_FRICTION = {"friction": 0.3, "velocity": 0.05}
 
 
-def simulator(name: str, law: str = "barrier", worlds: int = 1, **contact) -> tuple[Simulator, object]:
+def simulator(name: str, worlds: int = 1, **contact) -> tuple[Simulator, object]:
     """Return a simulator and a state of every world with sliding contacts."""
-    return simulated(scene_of(name, law, **contact), worlds)
+    return simulated(scene_of(name, **contact), worlds)
 
 
 def simulated(scene, worlds: int = 1):
@@ -36,17 +36,11 @@ def weighed(state):
 
 
 @pytest.mark.parametrize(
-    ("name", "law", "friction_iterations"),
-    [
-        ("crossing rods", "penalty", 1),
-        ("crossing rods", "penalty", 2),
-        ("rod on ball", "barrier", 1),
-        ("sheets", "barrier", 1),
-    ],
+    ("name", "friction_iterations"), [("crossing rods", 1), ("crossing rods", 2), ("rod on ball", 1), ("sheets", 1)]
 )
-def test_parameters_of_every_world_over_steps(name, law, friction_iterations):
+def test_parameters_of_every_world_over_steps(name, friction_iterations):
     """Gradients by contact parameters that differ between two worlds, over five sliding steps."""
-    sim, start = simulator(name, law, 2, friction_iterations=friction_iterations, **WITH_FRICTION)
+    sim, start = simulator(name, 2, friction_iterations=friction_iterations, **WITH_FRICTION)
     factor = torch.tensor([[1.0], [0.8]], dtype=torch.float64)
     names = [f"contact.{name}" for name in ("stiffness", "range", "friction", "radius")]
     usual = {name: sim.parameter(name, 2) for name in names}
@@ -71,14 +65,15 @@ SHAPES = {
 }
 
 
-@covering(1, shape=SHAPES, solves=(("barrier", 1), ("penalty", 1), ("barrier", 2), ("barrier", 3)))
-def test_moved_obstacles(shape, solves):
+@covering(1, shape=SHAPES, friction_iterations=(1, 2, 3))
+def test_moved_obstacles(shape, friction_iterations):
     """Four steps with poses of a grip that lifts, shifts and rotates an obstacle under a rod, and one that keeps the last pose."""
-    law, friction_iterations = solves
     scene = ddg.Scene(gravity=(1.0, 0.7, -40.0), mass_damping=0.7)
     bar(scene, RADIUS + 0.8 * RANGE)
     scene.add_obstacle(SHAPES[shape], motion=ddg.Grip(pivot=(0.01, 0.0, -0.02)), name="obstacle")
-    scene.contact(law=law, range=RANGE, stiffness=50.0, friction_iterations=friction_iterations, **WITH_FRICTION)
+    scene.contact(
+        law=law_of(shape), range=RANGE, stiffness=50.0, friction_iterations=friction_iterations, **WITH_FRICTION
+    )
     sim, start = simulated(scene)
     poses = torch.tensor([[[1e-4, 2e-4, 1e-4, 2e-3, -1e-3, 4e-3]]], dtype=torch.float64)
 
@@ -90,7 +85,7 @@ def test_moved_obstacles(shape, solves):
 
 
 def test_positions_and_velocities_at_the_start():
-    sim, start = simulator("crossing rods", "penalty", **WITH_FRICTION)
+    sim, start = simulator("crossing rods", **WITH_FRICTION)
 
     def loss(positions, velocities):
         state = sim.initial_state(positions=positions, velocities=velocities)
@@ -141,7 +136,7 @@ def test_transforms_and_checkpoints(friction_iterations):
 
 def test_a_world_in_which_a_step_fails_has_no_gradient_alone():
     """A world that starts in overlap fails and has no gradient; the other world keeps its own."""
-    sim, start = simulator("rod on plane", worlds=2)
+    sim, start = simulator("rod on plane", worlds=2, law="barrier")
     k = sim.parameter("contact.stiffness").requires_grad_()
     radius = sim.parameter("contact.radius")
     radius[1] *= 2.0
@@ -210,7 +205,7 @@ def test_an_equilibrium_by_parameters_of_every_world():
 )
 def test_learned_sections_act_in_contact(name, module, learned):
     """Learned radii and thicknesses act, also in contact, as in a scene that is built with them."""
-    sim, _ = simulator(name, "penalty")
+    sim, _ = simulator(name)
     factors = module(sim, names=(learned,))
     values = factors()
     (change,) = factors.parameters()
@@ -223,7 +218,7 @@ def test_learned_sections_act_in_contact(name, module, learned):
 
 
 def test_learned_radii_have_gradients():
-    sim, start = simulator("crossing rods", "penalty", **WITH_FRICTION)
+    sim, start = simulator("crossing rods", **WITH_FRICTION)
     factors = RodParameters(sim, names=("radius",))
 
     def loss(change):
@@ -234,7 +229,7 @@ def test_learned_radii_have_gradients():
 
 
 def test_explicit_contact_radii_are_kept():
-    sim, _ = simulated(scene_of("crossing rods", "penalty", radius={"upper": 1.2 * RADIUS}))
+    sim, _ = simulated(scene_of("crossing rods", radius={"upper": 1.2 * RADIUS}))
     factors = RodParameters(sim, names=("radius",))
     (change,) = factors.parameters()
     with torch.no_grad():
