@@ -231,8 +231,8 @@ FAULTS = (
     Fault(
         "adjoint of a step: velocity at the end dropped",
         "kernels/adjoint/time_step.py",
-        "by_v = w_free * (rho * m) - ended * before_kept",
-        "by_v = w_free * (rho * m)",
+        "- (ended - velocity) * start_weight",
+        "+ velocity * start_weight",
         ("tests/adjoint/test_adjoint.py",),
     ),
     Fault(
