@@ -6,7 +6,7 @@ import warp as wp
 
 from ddg_warp.kernels.core import islands, outcome
 from ddg_warp.kernels.elements.rod_layout import RodKind
-from ddg_warp.kernels.newton.line_search_parallel import decide_kernels
+from ddg_warp.kernels.newton.line_search import decide_kernels
 
 STEP, DECREASE, MAX_BACKTRACKS = 0.5, 2.0, 3  # length of the step; predicted decrease of a whole step [J]
 ROUNDING, SQUARE = 1e-6, 9.0  # rounding floor of the energy [J]; squared residual of the last iterate
@@ -24,7 +24,7 @@ CASES = {  # name -> change of the energy [J], predicted decrease [J], squared r
 
 def decided(device, backtracks: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return flags and scalars after the decision on an iterate of each case, a rod each."""
-    judge, _ = decide_kernels(RodKind(3, False, False, ()), wp.float64, wp.float64, False)
+    judge, _ = decide_kernels(RodKind(3, False, False, ()), wp.float64, False)
     change, predicted, square, _ = np.array(list(CASES.values()), float).T
     flags = np.zeros((len(islands.FLAGS), len(CASES)), np.int32)
     scalars = np.zeros((len(islands.SCALARS), len(CASES)))
