@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 from coupled_problem import Problem, frame_and_sheet, membrane_with_springs
 
-import ddg_warp as ddg
-from ddg_warp.geometry import meshes
 from ddg_warp.solve.equilibrium.tangent import Tangent
 from ddg_warp.solve.newton.coupled_newton import PRECONDITIONERS
 
@@ -93,57 +91,3 @@ def test_negative_curvature_stops_pcg_and_projects(device, preconditioner):
     rhs, direction = (array.numpy().reshape(2, -1) for array in (newton.system.rhs, newton.system.direction))
     assert ((rhs * direction).sum(1) > 0.0).all()
     assert np.isfinite(direction).all()
-
-
-@pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
-def test_multilevel_saves_iterations_for_the_same_step(device, precision):
-    """Levels of 8, 64 and 512 nodes need fewer iterations than block Jacobi, at the same residual tolerance."""
-    points, triangles = meshes.rectangle(24, 24, (1.0, 1.0), "alternating")
-    points_by_solver, iterations = [], []
-    for linear in ("block_jacobi", "multilevel"):
-        scene = ddg.Scene()
-        shell = scene.add_shell(
-            points, triangles, thickness=1e-3, material=ddg.Material(1e6, 0.3, 1000.0), bending="hinge"
-        )
-        scene.hold(shell, [0, 24])
-        model = scene.build(device, precision, worlds=2)
-        integrator, state = ddg.Integrator(model, linear=linear, check_every=1), model.state()
-        for _ in range(3):
-            state = integrator.step(state, 1.0 / 30.0)
-        points_by_solver.append(state.points())
-        statistics = integrator.statistics()
-        iterations.append(statistics["pcg_iterations"] / statistics["newton_iterations"]["mean"])
-    np.testing.assert_allclose(points_by_solver[1], points_by_solver[0], rtol=0.0, atol=1e-6)
-    np.testing.assert_array_equal(points_by_solver[1][0], points_by_solver[1][1])
-    assert iterations[1] < 0.7 * iterations[0]
-
-
-def test_level_blocks_are_galerkin_products(device):
-    """D_l is the diagonal of P^T H P, with P the translations of the node groups of a level on free dofs."""
-    points, triangles = meshes.rectangle(9, 7, (1.0, 0.8), "right")
-    scene = ddg.Scene()
-    shell = scene.add_shell(points, triangles, thickness=0.01, material=ddg.Material(1e6, 0.3, 1000.0))
-    scene.hold(shell, [0, 3, 9], "xz")
-    model = scene.build(device, "float64")
-    integrator = ddg.Integrator(model, linear="multilevel", check_every=1)
-    integrator.step(model.state(), 0.01)
-    newton = integrator._coupled.newton
-    newton.islands.needs_direction.fill_(1)
-    newton.krylov.levels.prepare(newton.system.matrix, newton.system.masks.fixed, newton.islands.needs_direction)
-    table, blocks = newton.sparsity, model.coupled.blocks
-    H = np.zeros((3 * blocks, 3 * blocks))
-    rows, columns, values = table.rows.numpy(), table.columns.numpy(), newton.system.matrix.numpy()
-    for p in np.flatnonzero(rows >= 0):
-        H[3 * rows[p] : 3 * rows[p] + 3, 3 * columns[p] : 3 * columns[p] + 3] = values[:, p].reshape(3, 3)
-    free = ~model.coupled.host.fixed.ravel()
-    order = newton.krylov.levels.order.numpy()
-    for level, groups in enumerate(newton.krylov.levels.counts):
-        for g in range(groups):
-            members = order[g * 8 ** (level + 1) : (g + 1) * 8 ** (level + 1)]
-            P = np.zeros((3 * blocks, 3))
-            for node in members:
-                P[3 * node : 3 * node + 3] = np.eye(3)
-            P[~free] = 0.0
-            expected = P.T @ H @ P
-            measured = newton.krylov.levels.blocks[level].numpy()[g]
-            np.testing.assert_allclose(measured, expected, rtol=0.0, atol=1e-10 * np.abs(H).max())

@@ -54,6 +54,7 @@ class StaticNewton(CoupledNewton):
     """`CoupledNewton` without inertia, in the precision of the state: no mass bounds the condition number."""
 
     banded = False  # products with fixed dofs are needed, too
+    keeps_levels = False  # without inertia, matrices of one solve have little in common
 
     def __init__(self, model, options: NewtonOptions):
         super().__init__(model, options, coupled_preconditioner(model.coupled), model.types.real)

@@ -3,134 +3,146 @@
 import numpy as np
 import warp as wp
 
+from ddg_warp import device_arrays
 from ddg_warp.kernels.linear import multilevel
-from ddg_warp.kernels.linear.multilevel import GROUP, PIECE
+from ddg_warp.solve.linear.hat_functions import coarse_levels
 
 
 class Multilevel:
-    """Node groups of all levels, and their additive (BPX) preconditioner.
+    """Hat functions of all levels, and their additive (BPX) preconditioner.
 
     Args:
         `coupled`, `table`: `CoupledModel` and its `SparseSystem`; linear: type of the linear algebra.
+
+    Attributes:
+        levels: `DeviceLevel` of each level, from fine to coarse.
     """
 
     def __init__(self, coupled, table, linear):
         self.coupled, self.table, self.device = coupled, table, coupled.device
-        H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
         nodes, worlds = coupled.host.nodes, coupled.worlds
-        order = curve_order(coupled.host.rest[:nodes])
-        rank = np.full(coupled.blocks, -1)
-        rank[order] = np.arange(nodes)
-        self.counts = [nodes]
-        while self.counts[-1] > GROUP:
-            self.counts.append(-(-self.counts[-1] // GROUP))
-        self.counts = self.counts[1:] or [1]
-        rows, columns = table.rows.numpy(), table.columns.numpy()
-        real = rows >= 0
-        a, b = np.where(real, rank[rows], -1), np.where(real, rank[columns], -1)
-        both = (a >= 0) & (b >= 0)
-        self.lists, size = [], GROUP
-        for groups in self.counts:
-            within = both & (a // size == b // size)
-            positions = np.flatnonzero(within)
-            target = a[positions] // size
-            self.lists.append(self._pieces(positions[np.argsort(target, kind="stable")], target, groups, M))
-            both &= ~within
-            size *= GROUP
-        self.order = wp.array(order.astype(np.int32), dtype=int, device=self.device)
-        self.group = wp.array(np.where(rank >= 0, rank // GROUP, -1).astype(np.int32), dtype=int, device=self.device)
-        self._none = wp.zeros(1, dtype=int, device=self.device)
+        levels = coarse_levels(coupled.host.rest[:nodes], _node_pattern(table, nodes))
+        self.levels = [DeviceLevel(level, worlds, linear, self.device) for level in levels]
+        M = wp.types.matrix((3, 3), linear)
+        largest = max((level.product.nnz for level in levels), default=0)
+        self._product = wp.zeros(worlds * largest, dtype=M, device=self.device)
+        self._outdated = wp.zeros(worlds, dtype=int, device=self.device)
+        self._any_outdated = wp.zeros(1, dtype=int, device=self.device)
+        self._first = wp.zeros(worlds, dtype=int, device=self.device)
+        made = multilevel.setup_kernels(linear, device_arrays.serial(self.device))
+        self._begin, self._spread, self._spread_coarse, self._contract, self._invert = made
+        self._restrict, self._correct, self._finish = multilevel.level_kernels(linear)
+        self.kernels = [*made, self._restrict, self._correct, self._finish]
 
-        def make(dtype):
-            return [wp.zeros(worlds * groups, dtype=dtype, device=self.device) for groups in self.counts]
+    def prepare(self, system, more: wp.array, iteration: wp.array | None = None) -> None:
+        """Set up the levels of a `LinearSystem` where H has changed.
 
-        self.blocks, self.inverses, self.sums, self.corrections = make(M), make(M), make(H), make(H)
-        self._no_members = wp.zeros(1, dtype=M, device=self.device)
-        self._collect, self._gather, self._restrict, self._correct, self._finish = multilevel.level_kernels(linear)
+        Args:
+            more: blocks (W N,) to be added to the diagonal of H, or empty.
+            iteration: (W,) iterations of Newton's method, of which the first set-up serves all; None for a set-up in each.
+        """
+        self._any_outdated.zero_()
+        inputs = [system.outdated, self._first if iteration is None else iteration]
+        self._launch(self._begin, self.coupled.worlds, inputs, [self._outdated, self._any_outdated])
+        wp.capture_if(self._any_outdated, lambda: self.set_up(system.matrix, system.masks.fixed, more))
 
-    def _pieces(self, items: np.ndarray, target: np.ndarray, groups: int, M) -> tuple:
-        """Return items of all groups in order, offsets of their pieces, first piece of each group, and buffers of piece sums."""
-        counts = np.bincount(target, minlength=groups)
-        pieces = -(-counts // PIECE)
-        first = np.concatenate([[0], np.cumsum(pieces)])
-        begins = np.concatenate([[0], np.cumsum(counts)])
-        within = np.arange(first[-1]) - np.repeat(first[:-1], pieces)
-        starts = np.append(np.repeat(begins[:-1], pieces) + PIECE * within, begins[-1])
-
-        def put(values):
-            return wp.array(values.astype(np.int32), dtype=int, device=self.device)
-
-        sums = wp.zeros(self.coupled.worlds * max(1, int(first[-1])), dtype=M, device=self.device)
-        return put(items), put(starts), put(first), sums
-
-    @property
-    def kernels(self) -> list:
-        """Kernels to load before a capture."""
-        return [self._collect, self._gather, self._restrict, self._correct, self._finish]
-
-    def prepare(self, matrix: wp.array, fixed: wp.array, wanted: wp.array) -> None:
-        """Sum and invert the diagonal blocks of all levels, in worlds that need a direction."""
-        table, members, count = self.table, self._no_members, 0
-        worlds = self.coupled.worlds
-        for groups, pieces_of_level, block, inverse in zip(
-            self.counts, self.lists, self.blocks, self.inverses, strict=True
-        ):
-            items, pieces, starts, sums = pieces_of_level
-            size = pieces.shape[0] - 1
-            wp.launch(
-                self._collect,
-                worlds * size,
-                [matrix, table.rows, table.columns, fixed, pieces, items, size, table.positions, wanted],
-                [sums],
-                device=self.device,
-            )
-            wp.launch(
-                self._gather,
-                worlds * groups,
-                [sums, size, starts, members, count, groups, wanted],
-                [block, inverse],
-                device=self.device,
-            )
-            members, count = block, groups
+    def set_up(self, matrix: wp.array, fixed: wp.array, more: wp.array) -> None:
+        """Compute the matrices of all levels, and the inverses of their diagonal blocks, in outdated worlds."""
+        table, coupled, below = self.table, self.coupled, None
+        for level in self.levels:
+            read = [level.parents, level.product_pattern, self._outdated]
+            if below is None:
+                finest = [matrix, table.columns, table.slices, table.positions, fixed, more]
+                read = [*finest, coupled.blocks, coupled.host.nodes, *read]
+                kernel = self._spread
+            else:
+                read, kernel = [below.matrix, below.pattern, *read], self._spread_coarse
+            self._sweep(kernel, level.product_pattern, read, [self._product])
+            read = [self._product, level.product_pattern, level.members, level.pattern, self._outdated]
+            self._sweep(self._contract, level.pattern, read, [level.matrix])
+            read = [level.matrix, level.diagonal, level.pattern.rows.shape[0], self._outdated]
+            self._launch(self._invert, coupled.worlds * level.hats, read, [level.inverse])
+            below = level
 
     def apply(self, residual, inactive_mask, wanted, z: wp.array, dots: wp.array) -> None:
         """Add the corrections of coarse levels to z, which has the finest one, and write r . z block by block."""
+        if not self.levels:
+            return
         worlds, nodes, blocks = self.coupled.worlds, self.coupled.host.nodes, self.coupled.blocks
-        values, order, count, stride = residual, self.order, nodes, blocks
-        for groups, sums in zip(self.counts, self.sums, strict=True):
-            wp.launch(
-                self._restrict,
-                worlds * groups,
-                [values, order, count, stride, groups, wanted],
-                [sums],
-                device=self.device,
-            )
-            values, order, count, stride = sums, self._none, groups, groups
-        above, above_groups = self.corrections[-1], 0
-        for level in reversed(range(len(self.counts))):
-            wp.launch(
-                self._correct,
-                worlds * self.counts[level],
-                [self.inverses[level], self.sums[level], above, above_groups, self.counts[level], wanted],
-                [self.corrections[level]],
-                device=self.device,
-            )
-            above, above_groups = self.corrections[level], self.counts[level]
-        wp.launch(
-            self._finish,
-            worlds * blocks,
-            [residual, self.corrections[0], self.group, inactive_mask, self.counts[0], blocks, wanted],
-            [z, dots],
-            device=self.device,
-        )
+        values, stride = residual, blocks
+        for level in self.levels:
+            read = [values, stride, level.members, level.hats, wanted]
+            self._launch(self._restrict, worlds * level.hats, read, [level.sums])
+            values, stride = level.sums, level.hats
+        above = self.levels[-1]
+        for level, upper in zip(reversed(self.levels), [None, *reversed(self.levels[1:])], strict=True):
+            hats, parents = (upper.hats, upper.parents) if upper else (0, level.parents)
+            read = [level.inverse, level.sums, above.correction, hats, parents, level.hats, wanted]
+            self._launch(self._correct, worlds * level.hats, read, [level.correction])
+            above = level
+        read = [residual, above.correction, above.parents, inactive_mask, above.hats, nodes, blocks, wanted]
+        self._launch(self._finish, worlds * blocks, read, [z, dots])
+
+    def _sweep(self, kernel, pattern, inputs: list, outputs: list) -> None:
+        device_arrays.sweep(kernel, self.coupled.worlds * pattern.rows.shape[0], inputs, outputs, self.device)
+
+    def _launch(self, kernel, dim: int, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim, inputs, outputs, device=self.device)
 
 
-def curve_order(points: np.ndarray) -> np.ndarray:
-    """Return the order of points (n, 3) along a Morton curve through their bounding box."""
-    low, span = points.min(0), np.ptp(points, axis=0)
-    cells = ((points - low) / max(span.max(), 1e-300) * (2**20 - 1)).astype(np.uint64)
-    code = np.zeros(len(points), np.uint64)
-    for bit in range(20):
-        for d in range(3):
-            code |= ((cells[:, d] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + d)
-    return np.argsort(code, kind="stable")
+class DeviceLevel:
+    """Device arrays of a `Level`.
+
+    Attributes:
+        hats: number of hats.
+        `parents`, `members`: hats of each point of the level below, points of each hat, with weights.
+        `product_pattern`, `pattern`: patterns of A P and P^T A P; `diagonal`: entries P^T A P of one hat.
+        `matrix`, `inverse`: P^T A P, and inverses of its diagonal blocks.
+        `sums`, `correction`: restricted residual, correction.
+    """
+
+    def __init__(self, level, worlds: int, linear, device):
+        H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
+        self.hats = level.weights.shape[1]
+        self.parents, self.members = (_list(each.tocsr(), linear, device) for each in (level.weights, level.weights.T))
+        self.product_pattern, self.pattern = (_pattern(each, device) for each in (level.product, level.pattern))
+        rows = _rows(level.pattern)
+        self.diagonal = _put(np.flatnonzero(rows == level.pattern.indices), device)
+        self.matrix = wp.zeros(worlds * len(rows), dtype=M, device=device)
+        self.inverse = wp.zeros(worlds * self.hats, dtype=M, device=device)
+        self.sums, self.correction = (wp.zeros(worlds * self.hats, dtype=H, device=device) for _ in range(2))
+
+
+def _node_pattern(table, nodes: int):
+    """Return the pattern of the matrix of nodes, symmetric with its diagonal, as a CSR matrix."""
+    from scipy.sparse import coo_matrix
+
+    rows, columns = table.rows.numpy(), table.columns.numpy()
+    real = (rows >= 0) & (rows < nodes) & (columns < nodes)
+    all_rows, all_columns = (np.concatenate([each[real], np.arange(nodes)]) for each in (rows, columns))
+    result = coo_matrix((np.ones(len(all_rows), np.int32), (all_rows, all_columns)), shape=(nodes, nodes)).tocsr()
+    result.sort_indices()
+    return result
+
+
+def _rows(matrix) -> np.ndarray:
+    """Return the row of each entry of a CSR matrix."""
+    return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+
+
+def _put(values: np.ndarray, device) -> wp.array:
+    return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
+
+
+def _pattern(matrix, device) -> multilevel.Pattern:
+    result = multilevel.Pattern()
+    result.rows, result.columns = _put(_rows(matrix), device), _put(matrix.indices, device)
+    result.starts = _put(matrix.indptr, device)
+    return result
+
+
+def _list(matrix, linear, device):
+    result = multilevel.list_type(linear)()
+    result.starts, result.items = _put(matrix.indptr, device), _put(matrix.indices, device)
+    result.weights = wp.array(matrix.data, dtype=linear, device=device)
+    return result

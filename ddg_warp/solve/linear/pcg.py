@@ -84,8 +84,12 @@ class PCG:
         self.begin(system)
         self.iterate(system)
 
-    def begin(self, system) -> None:
-        """Prepare the preconditioner, and start from zero directions."""
+    def begin(self, system, iteration: wp.array | None = None) -> None:
+        """Prepare the preconditioner, and start from zero directions.
+
+        Args:
+            iteration: (W,) iterations of Newton's method, if the levels of its first matrix serve the others, too.
+        """
         table, masks, blocks = self.sparsity, system.masks, self.coupled.blocks
         self._launch(
             self._invert,
@@ -100,7 +104,7 @@ class PCG:
         if self.chains:
             self.chains.prepare(system, self._unread[0])
         if self.levels:
-            self.levels.prepare(system.matrix, masks.fixed, system.outdated)
+            self.levels.prepare(system, self._more, iteration)
         self.precondition(system, self.p)
         self.sum(system.dots, self.total)
         self.busy.zero_()
@@ -179,12 +183,26 @@ class NewtonPCG(PCG):
     Args:
         tolerances: `ResidualTolerances`, whose ratios are overwritten; rtol: relative tolerance.
         relaxed: `RelaxedConvergence`, or None.
+        keeps_levels: True if the multilevel preconditioner of a solve's first matrix serves the others, too.
     """
 
-    def __init__(self, coupled, sparsity, chains, contact, linear, multilevel: bool, tolerances, rtol: float, relaxed):
+    def __init__(
+        self,
+        coupled,
+        sparsity,
+        chains,
+        contact,
+        linear,
+        multilevel: bool,
+        tolerances,
+        rtol: float,
+        relaxed,
+        keeps_levels: bool,
+    ):
         self.scale, real = natural_scale(coupled), coupled.real
         super().__init__(coupled, sparsity, chains, contact, linear, multilevel, scale=self.scale)
         self._tolerances, self._rtol, self._relaxed = tolerances, rtol, relaxed
+        self._keeps_levels = keeps_levels
         self._largest = Sums(coupled.worlds, tolerances.ratio.shape[1], real, coupled.device, largest=True)
         self._worst = wp.zeros(coupled.worlds, dtype=real, device=coupled.device)
         self._compare, self._confirm = coupled_pcg.confirm_kernels(real, linear)
@@ -197,7 +215,7 @@ class NewtonPCG(PCG):
     @timer("pcg")
     def solve(self, system, islands, after_cycle: Callable[[], None] | None = None) -> None:
         """Compute directions; see `PCG.solve` and, for `after_cycle`, `PCG.iterate`."""
-        self.begin(system)
+        self.begin(system, islands.iteration if self._keeps_levels else None)
         wp.capture_while(self.busy, lambda: self.reduce(system, islands, after_cycle))
 
     def reduce(self, system, islands, after_cycle: Callable[[], None] | None) -> None:

@@ -57,6 +57,9 @@ class CoupledNewton:
     """
 
     banded = True  # True if substructuring stores its blocks of H, which are valid on free dofs alone
+    keeps_levels = (
+        True  # True if the multilevel preconditioner of a solve's first matrix serves the others, without contact
+    )
 
     def __init__(
         self,
@@ -148,7 +151,7 @@ class CoupledNewton:
         if not self.exact:
             parts = self.sparsity, self.chains, self.contact and self.contact.hessian
             multilevel = preconditioner in ("multilevel", "chain_multilevel")
-            stop = self.tolerances, options.rtol, self.relaxed
+            stop = self.tolerances, options.rtol, self.relaxed, self.keeps_levels and not self.contact
             self.krylov = NewtonPCG(coupled, *parts, self.linear, multilevel, *stop)
 
     def _require_exact(self) -> None:
