@@ -97,7 +97,7 @@ def inverse_function(linear):
 
 
 @cache
-def solver_kernels(linear, indefinite: bool = False):
+def solver_kernels(linear, indefinite: bool = False, angles: bool = False):
     """Build the kernels of a solve, in the order of use.
 
     `invert`: invert diagonal blocks.
@@ -108,12 +108,14 @@ def solver_kernels(linear, indefinite: bool = False):
     `turn`: update the search direction.
     `test`: test convergence of each world.
 
+    `angles`: True if some blocks are twist angles, see `sliced_ell.product_functions`.
+
     If `indefinite`, H may be indefinite, with a definite preconditioner. Iterates are then the conjugate-gradient points of Paige and
     Saunders (SIAM J. Numer. Anal. 12, 1975, 617), which exist unless a curvature is zero.
     """
     H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
     _, free = product_functions(linear)
-    settle = settle_function(linear)
+    settle = settle_function(linear, angles)
     inverse_of, nonzero = inverse_function(linear), nonzero_function(linear)
     eps = wp.constant(linear(2.3e-16 if linear == wp.float64 else 1.2e-7))
 
@@ -226,6 +228,8 @@ def solver_kernels(linear, indefinite: bool = False):
         wanted: wp.array(dtype=int),
         blocks: int,
         positions: int,
+        nodes: int,
+        angles_end: int,
         product_out: wp.array(dtype=H),
         dots_out: wp.array2d(dtype=linear),
     ):
@@ -235,7 +239,20 @@ def solver_kernels(linear, indefinite: bool = False):
         if wanted[w] != 1:
             return
         settle(
-            matrix, columns, slices, inactive_mask, p, blocks, positions, i - w * blocks, w, H(), product_out, dots_out
+            matrix,
+            columns,
+            slices,
+            inactive_mask,
+            p,
+            blocks,
+            positions,
+            nodes,
+            angles_end,
+            i - w * blocks,
+            w,
+            H(),
+            product_out,
+            dots_out,
         )
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

@@ -136,7 +136,9 @@ def band_kernels(
             w = (tid - threads) / separate_blocks.shape[0]
             if wanted[w] == 1:
                 b = separate_blocks[tid - threads - w * separate_blocks.shape[0]]
-                settle(matrix, columns, slices, inactive_mask, p, blocks, positions, b, w, H(), product_out, dots_out)
+                settle(
+                    matrix, columns, slices, inactive_mask, p, blocks, positions, 0, 0, b, w, H(), product_out, dots_out
+                )
             return
         tile = tid / (bands.shape[1] * TILE)
         k = tid / TILE - tile * bands.shape[1]
@@ -162,12 +164,29 @@ def band_kernels(
         node = places[0, k, c]
         if node >= 0:
             y = H(u[0], u[1], u[2])
-            settle(matrix, columns, slices, inactive_mask, p, blocks, positions, node, w, y, product_out, dots_out)
+            settle(
+                matrix, columns, slices, inactive_mask, p, blocks, positions, 0, 0, node, w, y, product_out, dots_out
+            )
         if wp.static(twist):
             angle = places[1, k, c]
             if angle >= 0:
                 y = H(u[3], linear(0.0), linear(0.0))
-                settle(matrix, columns, slices, inactive_mask, p, blocks, positions, angle, w, y, product_out, dots_out)
+                settle(
+                    matrix,
+                    columns,
+                    slices,
+                    inactive_mask,
+                    p,
+                    blocks,
+                    positions,
+                    0,
+                    0,
+                    angle,
+                    w,
+                    y,
+                    product_out,
+                    dots_out,
+                )
 
     return assemble, clear, product
 
@@ -209,7 +228,7 @@ def product_walk_kernel(twist: bool, span: int, linear, split: bool = False):
             for b in range(blocks):
                 y = H()
                 if inactive_mask[b + shift] != ALL_INACTIVE:
-                    y = times(matrix, columns, slices, p, b, w * positions, shift)
+                    y = times(matrix, columns, slices, p, b, w * positions, shift, 0, 0)
                 product_out[b + shift] = y
             for c in range(count.shape[0]):
                 r = w * count.shape[0] + c

@@ -174,6 +174,7 @@ def assemble_kernel(
     exact_from: tuple[int | None, ...],
     local: tuple[bool, ...],
     drag: bool,
+    angles: bool,
     serial: bool,
 ):
     """Build the kernel of assembly.
@@ -181,7 +182,8 @@ def assemble_kernel(
     `assemble`: write or update H with up to `SETS` element sets, one thread a position.
 
     The kernel that `begins` adds inertia and drag; others add to H. `exact_from`: for each set, the first iteration with second
-    derivatives, the same for all, or None without. `local`: layout of the set's factor.
+    derivatives, the same for all, or None without. `local`: layout of the set's factor. `angles`:
+    True if some blocks are twist angles, see `product_functions`.
     """
     M, Mass, until = wp.types.matrix((3, 3), linear), mass_type(real, drag), until_function(serial)
     sums = tuple(
@@ -202,6 +204,8 @@ def assemble_kernel(
         rows: wp.array(dtype=int),
         columns: wp.array(dtype=int),
         positions: int,
+        nodes: int,
+        angles_end: int,
         set0: Own0,
         set1: Own1,
         set2: Own2,
@@ -240,18 +244,24 @@ def assemble_kernel(
                 m += wp.static(sums[min(4, last)])(set4, position, w, with_second)
             if wp.static(count > 5):
                 m += wp.static(sums[min(5, last)])(set5, position, w, with_second)
+            whole_row, whole_column = True, True
+            if wp.static(angles):
+                column = columns[position]
+                whole_row = row < nodes or row >= angles_end
+                whole_column = column < nodes or column >= angles_end
             for i in range(3):
                 for j in range(3):
-                    matrix[3 * i + j, p] = m[i, j]
+                    if (i == 0 or whole_row) and (j == 0 or whole_column):
+                        matrix[3 * i + j, p] = m[i, j]
 
     return assemble
 
 
 @cache
-def product_functions(linear):
+def product_functions(linear, angles: bool = False):
     """Return the device functions `times` and `free`.
 
-    `times(...)`: one row of H v.
+    `times(...)`: one row of H v; with `angles` among the blocks if true.
     `free(mask)`: 1 at free dofs, 0 at fixed ones.
     """
     H = wp.types.vector(3, linear)
@@ -272,9 +282,15 @@ def product_functions(linear):
         row: int,
         first: int,
         shift: int,
+        nodes: int,
+        angles_end: int,
     ):
-        """Return row `row` of H v in a world with positions from `first` and dof blocks from `shift` on."""
+        """Return row `row` of H v in a world with positions from `first` and dof blocks from `shift` on.
+
+        Blocks from `nodes` to `angles_end` are twist angles: other components than the first are zero, and not read.
+        """
         y = H()
+        whole_row = row < nodes or row >= angles_end
         slice = row / wp.static(SLICE)
         start = slices[slice] + row - slice * wp.static(SLICE)
         for p in range(start, slices[slice + 1], wp.static(SLICE)):
@@ -282,6 +298,16 @@ def product_functions(linear):
             if j >= 0:
                 entry = p + first
                 x = v[j + shift]
+                if wp.static(angles):
+                    if j >= nodes and j < angles_end:
+                        y[0] = y[0] + matrix[0, entry] * x[0]
+                        if whole_row:
+                            y[1] = y[1] + matrix[3, entry] * x[0]
+                            y[2] = y[2] + matrix[6, entry] * x[0]
+                        continue
+                    if not whole_row:
+                        y[0] = y[0] + matrix[0, entry] * x[0] + matrix[1, entry] * x[1] + matrix[2, entry] * x[2]
+                        continue
                 y[0] = y[0] + matrix[0, entry] * x[0] + matrix[1, entry] * x[1] + matrix[2, entry] * x[2]
                 y[1] = y[1] + matrix[3, entry] * x[0] + matrix[4, entry] * x[1] + matrix[5, entry] * x[2]
                 y[2] = y[2] + matrix[6, entry] * x[0] + matrix[7, entry] * x[1] + matrix[8, entry] * x[2]
@@ -291,13 +317,13 @@ def product_functions(linear):
 
 
 @cache
-def settle_function(linear):
+def settle_function(linear, angles: bool = False):
     """Return the device function `settle(...)`, which writes H p of a dof block, and p . H p.
 
-    `y` is added to H p; inactive dofs get zero.
+    `y` is added to H p; inactive dofs get zero. `angles`: see `product_functions`.
     """
     H = wp.types.vector(3, linear)
-    times, free = product_functions(linear)
+    times, free = product_functions(linear, angles)
 
     @wp.func
     def settle(
@@ -308,6 +334,8 @@ def settle_function(linear):
         p: wp.array(dtype=H),
         blocks: int,
         positions: int,
+        nodes: int,
+        angles_end: int,
         b: int,
         w: int,
         y: H,
@@ -318,7 +346,7 @@ def settle_function(linear):
         if inactive_mask[i] == ALL_INACTIVE:
             y = H()
         else:
-            y += times(matrix, columns, slices, p, b, w * positions, w * blocks)
+            y += times(matrix, columns, slices, p, b, w * positions, w * blocks, nodes, angles_end)
             y = wp.cw_mul(y, free(inactive_mask[i]))
         product_out[i] = y
         dots_out[w, b] = wp.dot(p[i], y)

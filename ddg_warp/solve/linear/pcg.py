@@ -67,7 +67,9 @@ class PCG:
         self.busy = wp.zeros(1, dtype=int, device=device)
         self._unread = [wp.zeros(worlds, dtype=int, device=device) for _ in range(2)]
         self.sum = Sums(worlds, coupled.blocks, linear, device)
-        self._invert, self._start, self._begin, *self._cycle = coupled_pcg.solver_kernels(linear, indefinite)
+        self._invert, self._start, self._begin, *self._cycle = coupled_pcg.solver_kernels(
+            linear, indefinite, sparsity.has_angles
+        )
         self._more = contact.diagonal if contact else wp.zeros(0, dtype=M, device=device)
         self.levels = Multilevel(coupled, sparsity, linear) if multilevel else None
         self._limit = max(200, 100 * math.isqrt(coupled.blocks))
@@ -169,7 +171,7 @@ class PCG:
         """Write the product without contact, with all of H in the sparse matrix."""
         table = self.sparsity
         inputs = [system.matrix, table.columns, table.slices, system.masks.inactive, p, system.wanted]
-        inputs += [self.coupled.blocks, table.positions]
+        inputs += [self.coupled.blocks, table.positions, *table.angles]
         self._launch(self._cycle[0], inputs, [self.product, system.dots])
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:

@@ -23,12 +23,15 @@ class SparseSystem:
         `positions`: number of entries of H in a world, padding included.
         `rows`, `columns`: block of each position, -1 in the padding.
         `slices`: offset of each slice.
+        angles: first block of a twist angle, and the first one after all of them; has_angles: True if there are any.
         `diagonal`: position of each H_ii, -1 if in bands or left out.
         `meets`, `adds`: incidence lists (offsets, items) of each element set, by blocks and by positions.
     """
 
     def __init__(self, coupled, kept: np.ndarray | None = None):
         blocks, device = coupled.blocks, coupled.device
+        self.angles = coupled.host.nodes, blocks - coupled.host.spins
+        self.has_angles = self.angles[0] < self.angles[1]
         out = None if kept is None else coupled.host.fixed.all(1)
         pairs = [_pairs(element_set.host, kept, out) for element_set in coupled.sets]
         diagonal_blocks = np.arange(blocks) if kept is None else np.flatnonzero(~(kept | out))
@@ -162,11 +165,8 @@ class MatrixAssembly:
                 each[first : first + sliced_ell.SETS] for each in (coupled.sets, exact_from, local)
             )
             terms = tuple(part.term for part in sets)
-            self.kernels.append(
-                sliced_ell.assemble_kernel(
-                    terms, coupled.real, linear, first == 0, from_iteration, local_dofs, drag, serial
-                )
-            )
+            layout = from_iteration, local_dofs, drag, table.has_angles, serial
+            self.kernels.append(sliced_ell.assemble_kernel(terms, coupled.real, linear, first == 0, *layout))
             set_data = []
             for i in range(first, first + len(sets)):
                 data = sliced_ell.contributions(linear, local[i])()
@@ -183,7 +183,7 @@ class MatrixAssembly:
             device_arrays.sweep(
                 kernel,
                 self.coupled.worlds * table.positions,
-                [mass, *islands.arrays, table.rows, table.columns, table.positions, *set_data],
+                [mass, *islands.arrays, table.rows, table.columns, table.positions, *table.angles, *set_data],
                 [matrix],
                 self.coupled.device,
             )
