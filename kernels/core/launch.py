@@ -68,3 +68,13 @@ def first_of(world: int, count: int):
     Warp's indexing need not wrap a nonnegative index, which saves the CPU three instructions an entry.
     """
     return wp.max(world * count, 0)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+""")
+def wait():
+    """Wait for all threads of the block, whose writes are then visible to each other."""
+    ...

@@ -13,17 +13,9 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.launch import CPU_OPTIONS
+from ddg_warp.kernels.core.launch import CPU_OPTIONS, wait
 from ddg_warp.kernels.linear.cyclic_reduction import block_functions
 from ddg_warp.kernels.linear.rod_dof_map import angle_function, path_node_dofs, solve_functions
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __syncthreads();
-#endif
-""")
-def wait(): ...
 
 
 @cache

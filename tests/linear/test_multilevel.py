@@ -8,6 +8,7 @@ from test_rod_substructuring import apply_preconditioner
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
+from ddg_warp.kernels.linear import multilevel
 from ddg_warp.scenes import cloth_on_sphere, hanging_sheet
 from ddg_warp.solve.linear.hat_functions import COARSEST, coarse_levels
 
@@ -81,13 +82,13 @@ def test_hats_of_many_small_pieces_end_with_translations():
     assert levels[-1].weights.shape[1] == 100
 
 
-def sheet_problem(device, name: str = "flat", cells: int = 16, **options) -> Problem:
+def sheet_problem(device, stretch: float = 1.02, name: str = "flat", cells: int = 16) -> Problem:
     """Return a Newton iteration of a sheet with a support in some directions only."""
     points, triangles = sheets(cells)[name]
     scene = ddg.Scene()
     shell = scene.add_shell(points, triangles, thickness=0.01, material=RUBBER, bending="hinge")
     scene.hold(shell, [0, 3, cells], "xz")
-    return Problem(scene, device, 1.02, preconditioner="multilevel", noise=1e-4, **options)
+    return Problem(scene, device, stretch, preconditioner="multilevel", noise=1e-4)
 
 
 def prolongations(levels, blocks: int) -> list[np.ndarray]:
@@ -109,14 +110,14 @@ def level_matrix(level, world: int) -> np.ndarray:
     """Return the dense matrix (3 hats, 3 hats) of a level."""
     rows, columns = level.pattern.rows.numpy(), level.pattern.columns.numpy()
     result = np.zeros((level.hats, 3, level.hats, 3))
-    result[rows, :, columns] = level.matrix.numpy().reshape(2, len(rows), 3, 3)[world]
+    result[rows, :, columns] = level.matrix.numpy()[world]
     return result.reshape(3 * level.hats, 3 * level.hats)
 
 
 @pytest.mark.parametrize("name", ["flat", "cylinder"])
 def test_level_matrices_are_galerkin_products(device, name):
     """A_l = P^T H P on free dofs, in both worlds."""
-    problem = sheet_problem(device, name).iterate(0.5)
+    problem = sheet_problem(device, name=name).iterate(0.5)
     levels, free = problem.newton.krylov.levels.levels, problem.free()
     assert len(levels) == 2
     for world in range(2):
@@ -125,14 +126,21 @@ def test_level_matrices_are_galerkin_products(device, name):
             expected = P.T @ H @ P
             matrix = level_matrix(level, world)
             np.testing.assert_allclose(matrix, expected, rtol=0.0, atol=1e-12 * np.abs(H).max())
-            inverse = level.inverse.numpy().reshape(2, -1, 3, 3)[world]
+            inverse = level.inverse.numpy()[world]
             blocks = matrix.reshape(level.hats, 3, level.hats, 3)[np.arange(level.hats), :, np.arange(level.hats)]
             np.testing.assert_allclose(inverse @ blocks, np.tile(np.eye(3), (level.hats, 1, 1)), rtol=0.0, atol=1e-9)
 
 
-def test_preconditioner_is_symmetric_positive_definite(device):
-    problem = sheet_problem(device, "irregular", 12).iterate(0.5)
+@pytest.mark.parametrize("small", [1280, 30, 0], ids=["cycle", "both", "additive"])
+@pytest.mark.parametrize("stretch", [1.02, 0.8], ids=["tension", "compression"])
+def test_preconditioner_is_symmetric_positive_definite(device, monkeypatch, small, stretch):
+    """Also where H is indefinite, for a V-cycle over all levels, over the last one only, and over some of them."""
+    monkeypatch.setattr(multilevel, "SMALL", small)
+    problem = sheet_problem(device, stretch, "irregular", 16)
+    problem.newton.islands.inertia_coefficient.fill_(1e-3)
+    problem.iterate(0.5)
     free = np.flatnonzero(problem.free())
+    assert (np.linalg.eigvalsh(problem.matrix(0)[np.ix_(free, free)])[0] < 0.0) == (stretch < 1.0)
     units = np.zeros((len(free), 2, 3 * problem.blocks))
     units[np.arange(len(free)), :, free] = 1.0
     results = apply_preconditioner(problem, units)
@@ -141,6 +149,18 @@ def test_preconditioner_is_symmetric_positive_definite(device):
         M = results[:, world, free]
         np.testing.assert_allclose(M, M.T, rtol=0.0, atol=1e-12 * np.abs(M).max())
         assert np.linalg.eigvalsh(M)[0] > 0.0
+
+
+def test_smoothers_of_the_cycle_converge(device):
+    """Damped block Jacobi has a spectral radius below one."""
+    newton = sheet_problem(device, name="cylinder").iterate(0.5).newton
+    tail = newton.krylov.levels.tail
+    for level, damping in zip(tail.levels[:-1], tail._damping.numpy()[0], strict=False):
+        A, blocks = level_matrix(level, 0), level.inverse.numpy()[0]
+        D = np.zeros((level.hats, 3, level.hats, 3))
+        D[np.arange(level.hats), :, np.arange(level.hats)] = blocks
+        largest = np.abs(np.linalg.eigvals(D.reshape(A.shape) @ A)).max()
+        assert 1.2 < damping * largest < 1.8
 
 
 def test_levels_contain_contact(device):

@@ -9,20 +9,24 @@ from ddg_warp.solve.linear.hat_functions import coarse_levels
 
 
 class Multilevel:
-    """Hat functions of all levels, and their additive (BPX) preconditioner.
+    """Hat functions of all levels: additive (BPX) preconditioner of the large ones, V-cycle over the small ones.
 
     Args:
         `coupled`, `table`: `CoupledModel` and its `SparseSystem`; linear: type of the linear algebra.
 
     Attributes:
-        levels: `DeviceLevel` of each level, from fine to coarse.
+        levels: `DeviceLevel` of each level, from fine to coarse; tail: the `DeviceTail` of the small ones.
     """
 
     def __init__(self, coupled, table, linear):
         self.coupled, self.table, self.device = coupled, table, coupled.device
         nodes, worlds = coupled.host.nodes, coupled.worlds
         levels = coarse_levels(coupled.host.rest[:nodes], _node_pattern(table, nodes))
-        self.levels = [DeviceLevel(level, worlds, linear, self.device) for level in levels]
+        small = [level.weights.shape[1] <= multilevel.SMALL for level in levels[:-1]]
+        self._large = small.index(True) if True in small else len(small)
+        self.tail = DeviceTail(levels[self._large :], worlds, linear, self.device) if levels else None
+        self.levels = [DeviceLevel(level, worlds, linear, self.device) for level in levels[: self._large]]
+        self.levels += self.tail.levels if levels else []
         M = wp.types.matrix((3, 3), linear)
         largest = max((level.product.nnz for level in levels), default=0)
         self._product = wp.zeros(worlds * largest, dtype=M, device=self.device)
@@ -32,7 +36,7 @@ class Multilevel:
         made = multilevel.setup_kernels(linear, device_arrays.serial(self.device))
         self._begin, self._spread, self._spread_coarse, self._contract, self._invert = made
         self._restrict, self._correct, self._finish = multilevel.level_kernels(linear)
-        self.kernels = [*made, self._restrict, self._correct, self._finish]
+        self.kernels = [*made, self._restrict, self._correct, self._finish, *(self.tail.kernels if self.tail else [])]
 
     def prepare(self, system, more: wp.array, iteration: wp.array | None = None) -> None:
         """Set up the levels of a `LinearSystem` where H has changed.
@@ -60,27 +64,28 @@ class Multilevel:
             self._sweep(kernel, level.product_pattern, read, [self._product])
             read = [self._product, level.product_pattern, level.members, level.pattern, self._outdated]
             self._sweep(self._contract, level.pattern, read, [level.matrix])
-            read = [level.matrix, level.diagonal, level.pattern.rows.shape[0], self._outdated]
+            read = [level.matrix, level.diagonal, self._outdated]
             self._launch(self._invert, coupled.worlds * level.hats, read, [level.inverse])
             below = level
+        if self.tail:
+            self.tail.damp(self._outdated)
 
     def apply(self, residual, inactive_mask, wanted, z: wp.array, dots: wp.array) -> None:
         """Add the corrections of coarse levels to z, which has the finest one, and write r . z block by block."""
-        if not self.levels:
+        if not self.tail:
             return
         worlds, nodes, blocks = self.coupled.worlds, self.coupled.host.nodes, self.coupled.blocks
-        values, stride = residual, blocks
-        for level in self.levels:
-            read = [values, stride, level.members, level.hats, wanted]
-            self._launch(self._restrict, worlds * level.hats, read, [level.sums])
-            values, stride = level.sums, level.hats
-        above = self.levels[-1]
-        for level, upper in zip(reversed(self.levels), [None, *reversed(self.levels[1:])], strict=True):
-            hats, parents = (upper.hats, upper.parents) if upper else (0, level.parents)
-            read = [level.inverse, level.sums, above.correction, hats, parents, level.hats, wanted]
+        values, large = residual.reshape((worlds, blocks)), self.levels[: self._large]
+        for level in large:
+            self._launch(self._restrict, worlds * level.hats, [values, level.members, level.hats, wanted], [level.sums])
+            values = level.sums
+        self.tail.correct(values, wanted)
+        above = self.levels[self._large]
+        for level in reversed(large):
+            read = [level.inverse, level.sums, above.correction, above.parents, level.hats, wanted]
             self._launch(self._correct, worlds * level.hats, read, [level.correction])
             above = level
-        read = [residual, above.correction, above.parents, inactive_mask, above.hats, nodes, blocks, wanted]
+        read = [residual, above.correction, above.parents, inactive_mask, nodes, blocks, wanted]
         self._launch(self._finish, worlds * blocks, read, [z, dots])
 
     def _sweep(self, kernel, pattern, inputs: list, outputs: list) -> None:
@@ -97,20 +102,88 @@ class DeviceLevel:
         hats: number of hats.
         `parents`, `members`: hats of each point of the level below, points of each hat, with weights.
         `product_pattern`, `pattern`: patterns of A P and P^T A P; `diagonal`: entries P^T A P of one hat.
-        `matrix`, `inverse`: P^T A P, and inverses of its diagonal blocks.
-        `sums`, `correction`: restricted residual, correction.
+        `matrix`, `inverse`: P^T A P, and inverses of its diagonal blocks, by world.
+        `sums`, `correction`: restricted residual, correction, by world.
     """
 
-    def __init__(self, level, worlds: int, linear, device):
-        H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
+    def __init__(self, level, worlds: int, linear, device, arrays: list | None = None):
         self.hats = level.weights.shape[1]
         self.parents, self.members = (_list(each.tocsr(), linear, device) for each in (level.weights, level.weights.T))
         self.product_pattern, self.pattern = (_pattern(each, device) for each in (level.product, level.pattern))
-        rows = _rows(level.pattern)
-        self.diagonal = _put(np.flatnonzero(rows == level.pattern.indices), device)
-        self.matrix = wp.zeros(worlds * len(rows), dtype=M, device=device)
-        self.inverse = wp.zeros(worlds * self.hats, dtype=M, device=device)
-        self.sums, self.correction = (wp.zeros(worlds * self.hats, dtype=H, device=device) for _ in range(2))
+        self.diagonal = _put(np.flatnonzero(_rows(level.pattern) == level.pattern.indices), device)
+        if arrays is None:
+            arrays = _arrays(level.pattern.nnz, self.hats, worlds, linear, device)
+        self.matrix, self.inverse, self.sums, self.correction = arrays
+
+
+class DeviceTail:
+    """V-cycle over the small levels, one block of threads a world; see `kernels.linear.multilevel.tail_kernels`.
+
+    Attributes:
+        levels: `DeviceLevel` of each level, with views of common arrays.
+    """
+
+    def __init__(self, levels, worlds: int, linear, device):
+        H = wp.types.vector(3, linear)
+        bounds = np.cumsum([0, *(level.weights.shape[1] for level in levels)])
+        entries = np.cumsum([0, *(level.pattern.nnz for level in levels)])
+        self._worlds, self._device = worlds, wp.get_device(device)
+        self._threads = multilevel.SMALL_THREADS if self._device.is_cuda else 1
+        arrays = _arrays(entries[-1], bounds[-1], worlds, linear, device)
+        self.levels = [
+            DeviceLevel(level, worlds, linear, device, [arrays[0][:, p:q], *(each[:, a:b] for each in arrays[1:])])
+            for level, p, q, a, b in zip(
+                levels, *(each.tolist() for each in (entries, entries[1:], bounds, bounds[1:])), strict=False
+            )
+        ]
+        self._matrix, self._inverse, self._residual, self._correction = arrays
+        self._change, self._z = (wp.zeros((worlds, bounds[-1]), dtype=H, device=device) for _ in range(2))
+        self._dots = wp.zeros((worlds, 2 * self._threads), dtype=linear, device=device)
+        self._damping = wp.ones((worlds, len(levels)), dtype=linear, device=device)
+        self._tail = multilevel.Tail()
+        self._tail.bounds = _put(bounds, device)
+        starts = [level.pattern.indptr[:-1] + first for level, first in zip(levels, entries, strict=False)]
+        self._tail.starts = _put(np.append(np.concatenate(starts), entries[-1]), device)
+        columns = [level.pattern.indices + first for level, first in zip(levels, bounds, strict=False)]
+        self._tail.columns = _put(np.concatenate(columns), device)
+        upward = _shifted([level.weights for level in levels[1:]], bounds)
+        self._parents, self._members = (_list(each.tocsr(), linear, device) for each in (upward, upward.T))
+        self._damp, self._cycle = multilevel.tail_kernels(linear)
+        self.kernels = [(kernel, self._threads) for kernel in (self._damp, self._cycle)]
+
+    def damp(self, outdated: wp.array) -> None:
+        """Find the damping of the smoothers in outdated worlds."""
+        read = [self._tail, self._matrix, self._inverse, self._threads, outdated]
+        self._launch(self._damp, read, [self._change, self._z, self._dots, self._damping])
+
+    def correct(self, values: wp.array, wanted: wp.array) -> None:
+        """Write the correction of the largest small level from `values` (worlds, points) of the level below."""
+        read = [values, self.levels[0].members, self._tail, self._members, self._parents]
+        read += [self._matrix, self._inverse, self._damping, self._threads, wanted]
+        self._launch(self._cycle, read, [self._residual, self._change, self._z, self._correction])
+
+    def _launch(self, kernel, inputs: list, outputs: list) -> None:
+        threads = self._worlds * self._threads
+        wp.launch(kernel, threads, inputs, outputs, device=self._device, block_dim=self._threads)
+
+
+def _arrays(entries: int, hats: int, worlds: int, linear, device) -> list[wp.array]:
+    """Return matrix, inverses, restricted residual and correction of levels, by world."""
+    H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
+    sizes = (entries, M), (hats, M), (hats, H), (hats, H)
+    return [wp.zeros((worlds, int(count)), dtype=dtype, device=device) for count, dtype in sizes]
+
+
+def _shifted(weights: list, bounds: np.ndarray):
+    """Return the weights of levels over each other as one CSR matrix (hats, hats), in the numbering of all levels."""
+    from scipy.sparse import coo_matrix
+
+    entries = [each.tocoo() for each in weights]
+    rows = [each.row + first for each, first in zip(entries, bounds, strict=False)]
+    columns = [each.col + first for each, first in zip(entries, bounds[1:], strict=False)]
+    none, size = np.zeros(0, int), int(bounds[-1])
+    values = np.concatenate([np.zeros(0), *(each.data for each in entries)])
+    return coo_matrix((values, (np.concatenate([none, *rows]), np.concatenate([none, *columns]))), (size, size)).tocsr()
 
 
 def _node_pattern(table, nodes: int):
