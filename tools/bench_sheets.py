@@ -1,10 +1,13 @@
 """Time a hanging sheet: elements, assembly, an iteration of conjugate gradients, a step, each with its floor by memory traffic.
 
-    python tools/bench_sheets.py [--device cuda:0] [--quick] [--statics] [--out DIR]
+    python tools/bench_sheets.py [--device cuda:0] [--quick] [--statics | --iterations] [--out DIR]
 
 Prints a table; writes sheets_DEVICE.csv and .json. With --statics: equilibria of a clamped plate under pressure by factors and by
-conjugate gradients, in statics_DEVICE.csv and .json. On CUDA the stages are captured graphs, timed by events over many launches; on
-the CPU the clock is process time. The floor counts data that a stage must read and write once, at 4.8 TB/s of an H200.
+conjugate gradients, in statics_DEVICE.csv and .json. With --iterations: iterations of conjugate gradients by mesh size, for meshes
+of several shapes, flat and in folds, in iterations_DEVICE.csv and .json.
+
+On CUDA the stages are captured graphs, timed by events over many launches; on the CPU the clock is process time. The floor counts data
+that a stage must read and write once, at 4.8 TB/s of an H200.
 """
 
 import argparse
@@ -26,6 +29,9 @@ BANDWIDTH = 4.8e12  # of an H200 [bytes/s]
 SIZES = {"hinge": (32, 70, 223, 707), "midedge": (32, 70, 223, 707), "midedge_dof": (32, 70, 223, 707)}
 
 
+SHAPES = ("flat", "clamped", "irregular", "cylinder", "graded")
+
+
 def sheet(cells: int, bending: str) -> ddg.Scene:
     """Return a square of 1 m and 1 mm, of rubber, fixed at two corners and released flat."""
     points, triangles = meshes.rectangle(cells, cells, (1.0, 1.0), "alternating")
@@ -38,6 +44,77 @@ def sheet(cells: int, bending: str) -> ddg.Scene:
     )
     scene.hold(shell, corners)
     return scene
+
+
+def shaped(shape: str, cells: int, bending: str) -> ddg.Scene:
+    """Return a rubber sheet of 1 m and 1 mm, fixed at two corners, or at the rim if `clamped`.
+
+    `irregular`: nodes moved by up to a fifth of a cell. `cylinder`: of radius 0.25 m. `graded`: sector of an annulus, with cells that
+    grow 20-fold.
+    """
+    flat, triangles = meshes.rectangle(cells, cells, (1.0, 1.0), "alternating")
+    flat = flat - flat.min(0)
+    x, y, _ = flat.T
+    rim = ((flat == 0.0) | (flat == 1.0))[:, :2].any(1)
+    points = flat
+    if shape == "irregular":
+        points = flat + (
+            ~rim[:, None] * np.random.default_rng(1).uniform(-0.2, 0.2, flat.shape) / cells * [1.0, 1.0, 0.0]
+        )
+    elif shape == "cylinder":
+        points = np.column_stack([0.25 * np.cos(4.0 * x), y, 0.25 * np.sin(4.0 * x)])
+    elif shape == "graded":
+        points = np.exp(3.0 * (x - 1.0))[:, None] * np.column_stack([np.cos(3.0 * y), np.sin(3.0 * y), 0.0 * x])
+    scene = ddg.Scene(gravity=(0.0, 0.0, -9.81), mass_damping=4.0)
+    material = ddg.Material(young=1e6, poisson=0.3, density=1000.0, viscosity=0.02)
+    shell = scene.add_shell(points, triangles, thickness=1e-3, material=material, bending=bending)
+    if shape == "clamped" and bending != "hinge":
+        scene.clamp_boundary(shell, np.flatnonzero(rim))
+    else:
+        scene.hold(shell, np.flatnonzero(rim if shape == "clamped" else (x == 0.0) & ((y == 0.0) | (y == 1.0))))
+    return scene
+
+
+def count_iterations(shape: str, cells: int, bending: str, rate: int, device, linear: str) -> dict:
+    """Return a row of the table of iterations: after 6 steps of 1/240 s, or in folds after 0.3 s of steps of 1/60 s."""
+    model = shaped(shape, cells, bending).build(device.alias, "mixed")
+    state = model.state()
+    if rate < 100:
+        loose = ddg.Integrator(model, linear=linear, rtol=1e-3, check_every=1)
+        for _ in range(18):
+            state = loose.step(state, 1.0 / rate)
+    integrator = ddg.Integrator(model, linear=linear, rtol=1e-6, check_every=1)
+    before = None
+    for step in range(12):
+        if step == 6:
+            before = integrator.statistics()
+        state = integrator.step(state, 1.0 / rate)
+    statistics = integrator.statistics()
+    levels = integrator._coupled.newton.krylov.levels
+    return {
+        "shape": shape,
+        "bending": bending,
+        "cells": cells,
+        "dt": f"1/{rate}",
+        "linear": linear,
+        "pcg_a_step": (statistics["pcg_iterations"] - before["pcg_iterations"]) / 6,
+        "newton_mean": statistics["newton_iterations"]["mean"],
+        "outcomes": ", ".join(f"{count} {name}" for name, count in statistics["outcomes"].items()),
+        "hats": " ".join(str(level.hats) for level in levels.levels) if levels else "",
+    }
+
+
+def iterations(chosen, device) -> list[dict]:
+    """Return rows of the table of iterations."""
+    rows = []
+    for bending in chosen.bending:
+        for shape in chosen.shapes:
+            for rate in (240, 60):
+                for cells in (16, 32) if chosen.quick else (32, 64, 128, 256, 512):
+                    if 2 * cells * cells <= chosen.largest:
+                        rows.append(count_iterations(shape, cells, bending, rate, device, chosen.linear))
+                        print(table(rows[-1:]), file=sys.stderr, flush=True)
+    return rows
 
 
 def plate(cells: int, pressure: float) -> ddg.Scene:
@@ -190,6 +267,8 @@ def main() -> int:
     parser.add_argument("--device", help="Warp device (default: CUDA if there is one)")
     parser.add_argument("--quick", action="store_true", help="small sizes: does it run?")
     parser.add_argument("--statics", action="store_true", help="equilibria instead of steps")
+    parser.add_argument("--iterations", action="store_true", help="iterations by mesh size instead of times")
+    parser.add_argument("--shapes", nargs="*", default=list(SHAPES), choices=SHAPES, help="of --iterations")
     parser.add_argument("--bending", nargs="*", default=list(SIZES), choices=list(SIZES))
     parser.add_argument("--linear", default="block_jacobi", choices=PRECONDITIONERS, help="preconditioner")
     parser.add_argument("--largest", type=int, default=10**6, help="largest number of triangles")
@@ -198,8 +277,13 @@ def main() -> int:
     chosen = parser.parse_args()
     wp.config.quiet = True
     device = wp.get_device(chosen.device)
-    rows = equilibria(chosen, device) if chosen.statics else steps(chosen, device)
-    stem = chosen.out / f"{'statics' if chosen.statics else 'sheets'}_{'cuda' if device.is_cuda else 'cpu'}"
+    name, rows_of = "sheets", steps
+    if chosen.statics:
+        name, rows_of = "statics", equilibria
+    elif chosen.iterations:
+        name, rows_of = "iterations", iterations
+    rows = rows_of(chosen, device)
+    stem = chosen.out / f"{name}_{'cuda' if device.is_cuda else 'cpu'}"
     command = " ".join(["python", "tools/bench_sheets.py", *sys.argv[1:]])
     write_table(stem, rows, {"command": command, "device": str(device), "machine": machine(chosen.commit)})
     print(table(rows))

@@ -134,7 +134,7 @@ def test_level_matrices_are_galerkin_products(device, name):
 @pytest.mark.parametrize("small", [1280, 30, 0], ids=["cycle", "both", "additive"])
 @pytest.mark.parametrize("stretch", [1.02, 0.8], ids=["tension", "compression"])
 def test_preconditioner_is_symmetric_positive_definite(device, monkeypatch, small, stretch):
-    """Also where H is indefinite, for a V-cycle over all levels, over the last one only, and over some of them."""
+    """Also where H is indefinite, for a V-cycle over all levels, over the last one, and without it."""
     monkeypatch.setattr(multilevel, "SMALL", small)
     problem = sheet_problem(device, stretch, "irregular", 16)
     problem.newton.islands.inertia_coefficient.fill_(1e-3)

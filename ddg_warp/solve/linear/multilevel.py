@@ -15,18 +15,22 @@ class Multilevel:
         `coupled`, `table`: `CoupledModel` and its `SparseSystem`; linear: type of the linear algebra.
 
     Attributes:
-        levels: `DeviceLevel` of each level, from fine to coarse; tail: the `DeviceTail` of the small ones.
+        levels: `DeviceLevel` of each level, from fine to coarse; tail: the `DeviceTail` of the small ones, if any.
     """
 
     def __init__(self, coupled, table, linear):
         self.coupled, self.table, self.device = coupled, table, coupled.device
+        from scipy.sparse import csr_matrix
+
         nodes, worlds = coupled.host.nodes, coupled.worlds
         levels = coarse_levels(coupled.host.rest[:nodes], _node_pattern(table, nodes))
-        small = [level.weights.shape[1] <= multilevel.SMALL for level in levels[:-1]]
-        self._large = small.index(True) if True in small else len(small)
-        self.tail = DeviceTail(levels[self._large :], worlds, linear, self.device) if levels else None
+        self._large = sum(level.weights.shape[1] > multilevel.SMALL for level in levels)
+        small = levels[self._large :]
+        self.tail = DeviceTail(small, worlds, linear, self.device) if small else None
         self.levels = [DeviceLevel(level, worlds, linear, self.device) for level in levels[: self._large]]
-        self.levels += self.tail.levels if levels else []
+        self.levels += self.tail.levels if small else []
+        coarsest = levels[-1].weights.shape[1] if levels else nodes
+        self._no_parents = _list(csr_matrix((coarsest, 0)), linear, self.device)
         M = wp.types.matrix((3, 3), linear)
         largest = max((level.product.nnz for level in levels), default=0)
         self._product = wp.zeros(worlds * largest, dtype=M, device=self.device)
@@ -72,20 +76,22 @@ class Multilevel:
 
     def apply(self, residual, inactive_mask, wanted, z: wp.array, dots: wp.array) -> None:
         """Add the corrections of coarse levels to z, which has the finest one, and write r . z block by block."""
-        if not self.tail:
+        if not self.levels:
             return
         worlds, nodes, blocks = self.coupled.worlds, self.coupled.host.nodes, self.coupled.blocks
         values, large = residual.reshape((worlds, blocks)), self.levels[: self._large]
         for level in large:
             self._launch(self._restrict, worlds * level.hats, [values, level.members, level.hats, wanted], [level.sums])
             values = level.sums
-        self.tail.correct(values, wanted)
-        above = self.levels[self._large]
+        above, parents = values, self._no_parents
+        if self.tail:
+            self.tail.correct(values, wanted)
+            above, parents = self.tail.levels[0].correction, self.tail.levels[0].parents
         for level in reversed(large):
-            read = [level.inverse, level.sums, above.correction, above.parents, level.hats, wanted]
+            read = [level.inverse, level.sums, above, parents, level.hats, wanted]
             self._launch(self._correct, worlds * level.hats, read, [level.correction])
-            above = level
-        read = [residual, above.correction, above.parents, inactive_mask, nodes, blocks, wanted]
+            above, parents = level.correction, level.parents
+        read = [residual, above, parents, inactive_mask, nodes, blocks, wanted]
         self._launch(self._finish, worlds * blocks, read, [z, dots])
 
     def _sweep(self, kernel, pattern, inputs: list, outputs: list) -> None:
