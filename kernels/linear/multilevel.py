@@ -80,7 +80,7 @@ def weighted_sum_function(linear):
 
 @cache
 def setup_kernels(linear, serial: bool):
-    """Build the kernels that set up levels, one thread an entry.
+    """Build the kernels that set up levels, one thread an entry of the result, or a row of the finest matrix.
 
     `begin`: find the worlds that need a set-up.
     `spread`: compute A P for the finest matrix A.
@@ -130,31 +130,35 @@ def setup_kernels(linear, serial: bool):
         outdated: wp.array(dtype=int),
         product_out: wp.array(dtype=M),
     ):
-        """Write A P on free dofs; `more` is added to diagonal blocks if not empty."""
+        """Write a row of A P on free dofs; `more` is added to diagonal blocks if not empty."""
         start = wp.tid()
         entries = pattern.rows.shape[0]
-        for t in range(start, until(start, outdated.shape[0] * entries)):
-            w = t / entries
+        for t in range(start, until(start, outdated.shape[0] * nodes)):
+            w = t / nodes
             if outdated[w] == 0:
                 continue
-            i, hat = pattern.rows[t - w * entries], pattern.columns[t - w * entries]
+            i = t - w * nodes
+            first, end = pattern.starts[i], pattern.starts[i + 1]
+            for q in range(first, end):
+                product_out[q + w * entries] = M()
             slice = i / wp.static(SLICE)
-            m = M()
             for p in range(slices[slice] + i - slice * wp.static(SLICE), slices[slice + 1], wp.static(SLICE)):
                 j = columns[p]
                 if j < 0 or j >= nodes:
                     continue
-                c = weight_of(parents, j, hat)
-                if c > linear(0.0):
-                    q = p + w * positions
-                    block = M()
-                    for a in range(3):
-                        for b in range(3):
-                            block[a, b] = matrix[3 * a + b, q]
-                    if i == j and more.shape[0] > 0:
-                        block += more[i + w * blocks]
-                    m += c * wp.cw_mul(block, wp.outer(free(fixed[i]), free(fixed[j])))
-            product_out[t] = m
+                block = M()
+                for a in range(3):
+                    for b in range(3):
+                        block[a, b] = matrix[3 * a + b, p + w * positions]
+                if i == j and more.shape[0] > 0:
+                    block += more[i + w * blocks]
+                block = wp.cw_mul(block, wp.outer(free(fixed[i]), free(fixed[j])))
+                for k in range(parents.starts[j], parents.starts[j + 1]):
+                    q = int(first)
+                    while pattern.columns[q] != parents.items[k]:
+                        q += 1
+                    q += w * entries
+                    product_out[q] = product_out[q] + parents.weights[k] * block
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def spread_coarse(

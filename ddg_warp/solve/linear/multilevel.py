@@ -62,12 +62,12 @@ class Multilevel:
             if below is None:
                 finest = [matrix, table.columns, table.slices, table.positions, fixed, more]
                 read = [*finest, coupled.blocks, coupled.host.nodes, *read]
-                kernel = self._spread
+                self._sweep(self._spread, coupled.host.nodes, read, [self._product])
             else:
-                read, kernel = [below.matrix, below.pattern, *read], self._spread_coarse
-            self._sweep(kernel, level.product_pattern, read, [self._product])
+                read = [below.matrix, below.pattern, *read]
+                self._sweep(self._spread_coarse, level.product_pattern.rows.shape[0], read, [self._product])
             read = [self._product, level.product_pattern, level.members, level.pattern, self._outdated]
-            self._sweep(self._contract, level.pattern, read, [level.matrix])
+            self._sweep(self._contract, level.pattern.rows.shape[0], read, [level.matrix])
             read = [level.matrix, level.diagonal, self._outdated]
             self._launch(self._invert, coupled.worlds * level.hats, read, [level.inverse])
             below = level
@@ -94,8 +94,8 @@ class Multilevel:
         read = [residual, above, parents, inactive_mask, nodes, blocks, wanted]
         self._launch(self._finish, worlds * blocks, read, [z, dots])
 
-    def _sweep(self, kernel, pattern, inputs: list, outputs: list) -> None:
-        device_arrays.sweep(kernel, self.coupled.worlds * pattern.rows.shape[0], inputs, outputs, self.device)
+    def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
+        device_arrays.sweep(kernel, self.coupled.worlds * count, inputs, outputs, self.device)
 
     def _launch(self, kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.device)
