@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from coupled_problem import Problem
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_matrix, eye
 from test_rod_substructuring import apply_preconditioner
 
 import ddg_warp as ddg
@@ -73,6 +73,16 @@ def test_hats_of_layers_near_each_other_are_separate():
         composite = composite @ level.weights
         first, second = (composite[part].any(0) for part in (slice(half), slice(half, None)))
         assert not (first & second).any() and (first | second).all()
+
+
+def test_points_without_neighbours_have_no_hats():
+    """Nodes of obstacles do not change grids and axes."""
+    points, triangles = sheets()["flat"]
+    expected = coarse_levels(points, pattern(points, triangles))
+    more = np.concatenate([points, [[0.3, 0.2, -5.0]]])
+    levels = coarse_levels(more, (pattern(more, triangles) + eye(len(more))).tocsr())
+    assert not levels[0].weights[-1].nnz and (levels[0].weights[:-1] != expected[0].weights).nnz == 0
+    assert [level.weights.shape[1] for level in levels] == [level.weights.shape[1] for level in expected]
 
 
 def test_hats_of_many_small_pieces_end_with_translations():

@@ -19,7 +19,7 @@ class Level:
     """Hats of a level over the points of the level below.
 
     Attributes:
-        weights: (points, hats) CSR matrix P; rows sum to one.
+        weights: (points, hats) CSR matrix P; rows sum to one, or to zero for points without neighbours.
         product: pattern of A P, for the matrix A of the level below, as a CSR matrix.
         pattern: pattern of P^T A P, as a CSR matrix.
     """
@@ -40,7 +40,14 @@ def coarse_levels(points: np.ndarray, pattern) -> list[Level]:
     no entry of the matrix joins has one hat for each of them: layers near each other stay independent. Points whose neighbours are far
     apart, compared with the spacing, are carried to the next level. So graded meshes are coarsened from the finest cells on.
     """
-    x, levels, size = points @ _axes(points), [], None
+    from scipy.sparse import identity
+
+    joined = np.diff(pattern.indptr) > 1
+    if np.count_nonzero(joined) <= COARSEST:
+        return []
+    embedding = identity(len(points), format="csr")[:, joined]
+    x, pattern, levels, size = points[joined], pattern[joined][:, joined], [], None
+    x = x @ _axes(x)
     while len(x) > COARSEST:
         near = _nearest(x, pattern)
         finite = np.isfinite(near)
@@ -51,6 +58,8 @@ def coarse_levels(points: np.ndarray, pattern) -> list[Level]:
         weights, x, size = _hats(x, near, pattern, size)
         product = _ones(pattern @ _ones(weights))
         pattern = _ones(_ones(weights).T @ product)
+        if not levels:
+            weights, product = embedding @ weights, _ones(embedding @ product)
         levels.append(Level(weights, product, pattern))
         size = 2.0 * size
     return levels

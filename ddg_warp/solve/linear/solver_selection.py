@@ -22,8 +22,9 @@ LONGEST_REPEATED = 8192
 # Nodes of the coupled system outside rods from which multilevel iterations pay.
 #
 # Measured: on a CPU core a sheet of 16 x 16 cells by hinges takes 0.9 of block Jacobi's time, and 0.55 by edge angles; 32 x 32 cells
-# take 0.67 and 0.37.
-LARGE = 1024
+# take 0.67 and 0.37. In contact, levels are set up for every matrix: a cloth of 32 x 32 cells on a ball takes half the iterations and
+# 1.2 of the time.
+LARGE, LARGE_IN_CONTACT = 1024, 4096
 
 # Substructuring of rods (preconditioner `"chain"`) against block Jacobi, see `coupled_preconditioner`. BETWEEN: nodes of a rod between
 # joints from which substructuring pays. The time unit is a block Jacobi iteration on a GPU: a path node takes 1 / `PATH_NODES`, the
@@ -87,8 +88,9 @@ def why_not_pcg(model) -> str:
 def coupled_preconditioner(coupled) -> str:
     """Return the preconditioner: `"chain"` for rods long between joints, `"multilevel"` for large systems, both, or block Jacobi."""
     host = coupled.host
+    large = LARGE_IN_CONTACT if host.touching else LARGE
     if not host.rods:
-        return "multilevel" if host.nodes >= LARGE else "block_jacobi"
+        return "multilevel" if host.nodes >= large else "block_jacobi"
     rod_nodes = np.concatenate([rod.all_nodes for rod in host.rods])
     joints = np.bincount(rod_nodes, minlength=host.nodes) > 1
     rigid = np.zeros(host.nodes, bool)
@@ -101,7 +103,7 @@ def coupled_preconditioner(coupled) -> str:
         reduced = long_and_few(places, len(host.rods) * coupled.worlds, coupled.device)
         pays = 0.25 * between**2 > LAUNCHES + (min(places, REDUCED) if reduced else places) / PATH_NODES
     rest = host.nodes - len(np.unique(rod_nodes)) if pays else host.nodes
-    names = ["chain"] * pays + ["multilevel"] * (rest >= LARGE)
+    names = ["chain"] * pays + ["multilevel"] * (rest >= large)
     return "_".join(names) or "block_jacobi"
 
 
