@@ -218,15 +218,21 @@ def setup_kernels(linear, serial: bool):
     def invert(
         matrix: wp.array2d(dtype=M),
         diagonal: wp.array(dtype=int),
+        members: List,
+        additive: int,
         outdated: wp.array(dtype=int),
         inverse_out: wp.array2d(dtype=M),
     ):
+        """Write inverses of diagonal blocks; zero on an additive level for a hat of one member, which has that correction itself."""
         i = wp.tid()
         hats = diagonal.shape[0]
         w = i / hats
         if outdated[w] == 0:
             return
         k = i - w * hats
+        if additive != 0 and members.starts[k + 1] - members.starts[k] == 1:
+            inverse_out[w, k] = M()
+            return
         m = matrix[w, diagonal[k]]
         s = H()
         for d in range(3):

@@ -57,7 +57,7 @@ class Multilevel:
     def set_up(self, matrix: wp.array, fixed: wp.array, more: wp.array) -> None:
         """Compute the matrices of all levels, and the inverses of their diagonal blocks, in outdated worlds."""
         table, coupled, below = self.table, self.coupled, None
-        for level in self.levels:
+        for index, level in enumerate(self.levels):
             read = [level.parents, level.product_pattern, self._outdated]
             if below is None:
                 finest = [matrix, table.columns, table.slices, table.positions, fixed, more]
@@ -68,7 +68,7 @@ class Multilevel:
                 self._sweep(self._spread_coarse, level.product_pattern.rows.shape[0], read, [self._product])
             read = [self._product, level.product_pattern, level.members, level.pattern, self._outdated]
             self._sweep(self._contract, level.pattern.rows.shape[0], read, [level.matrix])
-            read = [level.matrix, level.diagonal, self._outdated]
+            read = [level.matrix, level.diagonal, level.members, int(index < self._large), self._outdated]
             self._launch(self._invert, coupled.worlds * level.hats, read, [level.inverse])
             below = level
         if self.tail:
