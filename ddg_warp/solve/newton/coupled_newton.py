@@ -58,7 +58,7 @@ class CoupledNewton:
 
     banded = True  # True if substructuring stores its blocks of H, which are valid on free dofs alone
     keeps_levels = (
-        True  # True if the multilevel preconditioner of a solve's first matrix serves the others, without contact
+        True  # True if the first multilevel preconditioner of a solve without contact serves all its matrices
     )
 
     def __init__(
