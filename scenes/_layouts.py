@@ -49,10 +49,10 @@ def placed_apart(rng, count: int, length: float, separation: float, size, height
             trial, rods = trial[free], rods[free]
         taken: set[int] = set()
         earlier: list[list] = [[] for _ in rods]
-        for rod, other in zip(*_overlaps(_pieces(rods), _pieces(rods), separation).tolist(), strict=True):
-            earlier[rod] += [other] * (other < rod)
-        for rod, others in enumerate(earlier):
-            taken |= {rod} if taken.isdisjoint(others) else set()
+        for rod, neighbour in zip(*_overlaps(_pieces(rods), _pieces(rods), separation).tolist(), strict=True):
+            earlier[rod] += [neighbour] * (neighbour < rod)
+        for rod, neighbours in enumerate(earlier):
+            taken |= {rod} if taken.isdisjoint(neighbours) else set()
         accepted = sorted(taken)[: count - done]
         placed[done : done + len(accepted)] = rods[accepted]
         done += len(accepted)
@@ -90,11 +90,11 @@ def _pieces(rods: np.ndarray) -> tuple:
 
 def _overlaps(first: tuple, second: tuple, separation: float) -> np.ndarray:
     """Return pairs (2, n) of rods of one length, of two results of `_pieces`, that are closer than `separation`."""
-    (rods, tree), (others, others_tree) = first, second
+    (rods, tree), (candidates, candidates_tree) = first, second
     within = np.linalg.norm(np.diff(rods, axis=1), axis=-1).max(initial=0.0) / PIECES + separation
-    near = tree.sparse_distance_matrix(others_tree, 1.001 * within, output_type="ndarray")
+    near = tree.sparse_distance_matrix(candidates_tree, 1.001 * within, output_type="ndarray")
     pairs = np.stack([near["i"], near["j"]]) // PIECES
-    return pairs[:, distances(*rods[pairs[0]].swapaxes(0, 1), others[pairs[1]]) < separation]
+    return pairs[:, distances(*rods[pairs[0]].swapaxes(0, 1), candidates[pairs[1]]) < separation]
 
 
 def distances(start: np.ndarray, end: np.ndarray, segments: np.ndarray) -> np.ndarray:
@@ -116,8 +116,8 @@ def _between(a, b, c, d) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return r + s[:, None] * u - t[:, None] * v, s, t
 
 
-def resolve_overlaps(points: np.ndarray, apart: float, held: int = 0, rounds: int = 400) -> np.ndarray:
-    """Move nodes of rods (rods, nodes, 3) until edges of two rods are `apart` [m] apart; the first `held` nodes are fixed.
+def resolve_overlaps(points: np.ndarray, min_distance: float, num_fixed: int = 0, rounds: int = 400) -> np.ndarray:
+    """Move nodes of rods (rods, nodes, 3) until edges of two rods are `min_distance` [m] apart; the first `num_fixed` nodes are fixed.
 
     Edges that are too close move by equal amounts along the line between closest points, so that crossing rods separate.
 
@@ -127,19 +127,19 @@ def resolve_overlaps(points: np.ndarray, apart: float, held: int = 0, rounds: in
     rods, nodes, _ = points.shape
     flat = points.reshape(-1, 3).copy()
     first = np.delete(np.arange(len(flat)).reshape(rods, nodes), -1, axis=1).ravel()
-    free = np.tile(np.arange(nodes) >= held, rods)
+    free = np.tile(np.arange(nodes) >= num_fixed, rods)
     since, near = np.inf, None
     for _ in range(rounds):
-        if since > apart:  # each edge of a pair may have moved by this much
-            near, since = _near(flat, first, nodes, 4.0 * apart), 0.0
+        if since > min_distance:  # each edge of a pair may have moved by this much
+            near, since = _near(flat, first, nodes, 4.0 * min_distance), 0.0
         first_edge, second = near.T
         away, s, t = _between(flat[first_edge], flat[first_edge + 1], flat[second], flat[second + 1])
         distance = np.linalg.norm(away, axis=1)
-        close = np.flatnonzero(distance < apart)
+        close = np.flatnonzero(distance < min_distance)
         if not len(close):
             return flat.reshape(points.shape)
         correction = away[close] / np.maximum(distance[close], 1e-12)[:, None]
-        correction *= 0.5 * (1.02 * apart - distance[close])[:, None]
+        correction *= 0.5 * (1.02 * min_distance - distance[close])[:, None]
         moved, weights = np.zeros_like(flat), np.full(len(flat), 1e-12)
         for edge, parameter, shift in ((first_edge, s, correction), (second, t, -correction)):
             for node, weight in ((edge[close], 1.0 - parameter[close]), (edge[close] + 1, parameter[close])):
@@ -149,7 +149,7 @@ def resolve_overlaps(points: np.ndarray, apart: float, held: int = 0, rounds: in
         flat += moved
         since += np.linalg.norm(moved, axis=1).max()
     raise ValueError(
-        f"{len(close)} pairs of edges are still closer than {apart:.3g} m after {rounds} rounds; take fewer or thinner rods"
+        f"{len(close)} pairs of edges are still closer than {min_distance:.3g} m after {rounds} rounds; take fewer or thinner rods"
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.run.check import once_reached
-from ddg_warp.scenes import _touching
+from ddg_warp.scenes import _many_rods
 
 FINGERS = 5
 LENGTH = 0.2  # m, of a finger
@@ -67,7 +67,7 @@ def standing(model, seed: int):
     points = model.state().points()
     free = np.arange(model.scene.batches[0].nodes) > 1
     return model.state(
-        points=points + 0.5 * RANGE * np.tile(free, FINGERS)[:, None] * _touching.jitter(points.shape, seed)
+        points=points + 0.5 * RANGE * np.tile(free, FINGERS)[:, None] * _many_rods.jitter(points.shape, seed)
     )
 
 
@@ -100,7 +100,7 @@ def observe(model, state) -> dict[str, float]:
         "pressed": float(each.sum()),
         "pull": float(palm - weight(model)),
         "unlike": float(np.ptp(each) / max(each.mean(), 1e-300)),
-        "gap": _touching.smallest_gap(model, state),
+        "gap": _many_rods.smallest_gap(model, state),
     }
 
 
@@ -116,13 +116,13 @@ def check(result) -> list[ddg.Check]:
         "pull over mu times what presses on the post",
         "fingers press on the post unlike",
     )
-    return once_reached(result, END, names, lambda: _checks(result, names)) + _touching.kept_apart(result)
+    return once_reached(result, END, names, lambda: _checks(result, names)) + _many_rods.kept_apart(result)
 
 
 def _checks(result, names) -> list[ddg.Check]:
     series, t = {name: np.array(values) for name, values in result.series.items()}, np.array(result.times)
     slides, still = t > PULLS + 0.6 * (END - PULLS), (t > WINDS + 0.25) & (t <= PULLS)
-    mu = result.model.scene.touching.friction
+    mu = result.model.scene.contact_parameters.friction
     wound = LENGTH / np.hypot(POST + RADIUS, RISE) / (2.0 * np.pi)
     ratio = series["pull"][slides] / (mu * series["pressed"][slides])
     return [
@@ -151,6 +151,6 @@ def picture(result, frames) -> dict:
     return {
         "points_by_time": {t: frames[t] for t in times},
         "bodies": post,
-        "colors": _touching.colors(result.model),
+        "colors": _many_rods.colors(result.model),
         "side_by_side": True,
     }

@@ -11,7 +11,7 @@ import numpy as np
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.run.check import once_reached
-from ddg_warp.scenes import _touching
+from ddg_warp.scenes import _many_rods
 
 LENGTH = 0.6  # m
 RADIUS = 2e-3  # m
@@ -50,7 +50,7 @@ def build(
     laid = np.ceil((LENGTH - LIES) / speed / dt) * dt
     scene = ddg.Scene(analysis=ddg.Dynamics(dt=dt, duration=laid + np.ceil(REST / dt) * dt), mass_damping=damping)
     points = hanging(np.linspace(0.0, LENGTH, n + 1), LIES)
-    points += 0.2 * RANGE * (np.arange(n + 1) < n)[:, None] * _touching.jitter(points.shape, seed)
+    points += 0.2 * RANGE * (np.arange(n + 1) < n)[:, None] * _many_rods.jitter(points.shape, seed)
     section = ddg.Stiffness(
         EA=EA,
         EI1=EI,
@@ -113,7 +113,7 @@ def observe(model, state) -> dict[str, float]:
         "up": float(grip[2]),
         "carried": float(table[2]),
         "speed": float(np.linalg.norm(state.velocities(), axis=-1).max()),
-        "gap": _touching.smallest_gap(model, state),
+        "gap": _many_rods.smallest_gap(model, state),
     }
 
 
@@ -128,7 +128,7 @@ def check(result) -> list[ddg.Check]:
     )
     analysis = result.model.scene.analysis
     checks = once_reached(result, analysis.duration, names, lambda: _checks(result, analysis.duration, names))
-    return checks + _touching.kept_apart(result)
+    return checks + _many_rods.kept_apart(result)
 
 
 def _checks(result, duration, names) -> list[ddg.Check]:
@@ -162,5 +162,5 @@ def picture(result, frames) -> dict:
     table = np.column_stack([low + (high - low) * corners[:, :2], 0.0 * corners[:, 0]])
     return {
         "points_by_time": frames,
-        "bodies": {min(frames): (table, cells), last: _touching.tubes(result.model, frames[last])},
+        "bodies": {min(frames): (table, cells), last: _many_rods.tubes(result.model, frames[last])},
     }

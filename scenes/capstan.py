@@ -14,7 +14,7 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.run.check import once_reached
-from ddg_warp.scenes import _touching
+from ddg_warp.scenes import _many_rods
 
 DRUM = 0.05  # m, radius
 RADIUS = 0.001  # m
@@ -79,7 +79,7 @@ def build(
     scene.contact(
         range=range,
         stiffness=stiffness,
-        **_touching.rubbing(friction, velocity=velocity, friction_iterations=friction_iterations),
+        **_many_rods.friction_options(friction, velocity=velocity, friction_iterations=friction_iterations),
     )
     return scene
 
@@ -105,7 +105,9 @@ def wound(angle: float, edge: float, radius: float) -> tuple[np.ndarray, np.ndar
 def bent(model, points: np.ndarray, seed: int):
     """Return the wound state of the rod; its rest shape is straight."""
     free = np.arange(len(points))[:, None] < len(points) - 1
-    return model.state(points=points + 0.2 * model.scene.touching.range * free * _touching.jitter(points.shape, seed))
+    return model.state(
+        points=points + 0.2 * model.scene.contact_parameters.range * free * _many_rods.jitter(points.shape, seed)
+    )
 
 
 def observe(model, state) -> dict[str, float]:
@@ -114,7 +116,7 @@ def observe(model, state) -> dict[str, float]:
     drawn = np.reshape(model.reactions(state)[0].force, (-1, 3))[0]
     return {
         "ratio": float(np.linalg.norm(drawn) / np.linalg.norm(slack)),
-        "gap": _touching.smallest_gap(model, state),
+        "gap": _many_rods.smallest_gap(model, state),
     }
 
 
@@ -140,12 +142,12 @@ def check(result) -> list[ddg.Check]:
     """Check the ratio of tensions against a rod and a string."""
     names = ("T2 / T1 of a rod", "T2 / T1 of a string")
     checks = once_reached(result, result.model.scene.analysis.duration, names, lambda: _checks(result, names))
-    return checks + _touching.kept_apart(result)
+    return checks + _many_rods.kept_apart(result)
 
 
 def _checks(result, names) -> list[ddg.Check]:
     scene = result.model.scene
-    mu, slack = scene.touching.friction, np.array(scene.loads[0].force)
+    mu, slack = scene.contact_parameters.friction, np.array(scene.loads[0].force)
     tension = np.linalg.norm(slack)
     steps = np.diff(scene.batches[0].points[0], axis=0)
     steps /= np.linalg.norm(steps, axis=1)[:, None]

@@ -9,7 +9,7 @@ import numpy as np
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.run.check import once_reached
-from ddg_warp.scenes import _touching
+from ddg_warp.scenes import _many_rods
 
 SIDE = 1.0  # m
 THICKNESS = 2e-3  # m
@@ -46,23 +46,23 @@ def build(
     scene = ddg.Scene(
         mass_damping=damping,
         analysis=ddg.Dynamics(dt=dt, duration=duration),
-        initial=lambda model: _touching.jittered(model, seed),
+        initial=lambda model: _many_rods.jittered(model, seed),
     )
     scene.add_shell(points, triangles, thickness=THICKNESS, material=MATERIAL, bending="hinge", name="cloth")
-    scene.contact(law=law, range=RANGE, **_touching.rubbing(friction, velocity=1e-2))
+    scene.contact(law=law, range=RANGE, **_many_rods.friction_options(friction, velocity=1e-2))
     scene.add_obstacle(ddg.Sphere((0.0, 0.0, RADIUS), RADIUS), name="ball")
     scene.add_obstacle(ddg.Plane(), name="floor")
     return scene
 
 
 def observe(model, state) -> dict[str, float]:
-    """Return `_touching.observe` with the lowest vertex and the largest speed."""
+    """Return `_many_rods.observe` with the lowest vertex and the largest speed."""
     speed = np.linalg.norm(state.velocities().reshape(-1, 3), axis=1).max()
-    return _touching.observe(model, state) | {"lowest": state.points()[:, 2].min(), "speed": float(speed)}
+    return _many_rods.observe(model, state) | {"lowest": state.points()[:, 2].min(), "speed": float(speed)}
 
 
 def check(result) -> list[ddg.Check]:
     """Check that nothing interpenetrates, and that ball and floor carry the weight at rest, partly by friction."""
     names = ("force of obstacles less inertia over weight",)
-    checks = _touching.checks(result, REFUSED)
-    return checks + once_reached(result, RESTS, names, lambda: [_touching.weight_check(result, 0.1)])
+    checks = _many_rods.checks(result, REFUSED)
+    return checks + once_reached(result, RESTS, names, lambda: [_many_rods.weight_check(result, 0.1)])

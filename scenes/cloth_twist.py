@@ -8,7 +8,7 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.scenes import _touching
+from ddg_warp.scenes import _many_rods
 
 RADIUS, LENGTH = 0.1, 0.3  # m
 THICKNESS = 1e-3  # m
@@ -45,13 +45,13 @@ def build(
         gravity=(0.0, 0.0, 0.0),
         mass_damping=2.0,
         analysis=ddg.Dynamics(dt=dt, duration=duration),
-        initial=lambda model: _touching.jittered(model, seed),
+        initial=lambda model: _many_rods.jittered(model, seed),
     )
     shell = scene.add_shell(points, triangles, thickness=THICKNESS, material=MATERIAL, bending="hinge", name="cloth")
     for end, sign in ((points[:, 2].min(), -1.0), (points[:, 2].max(), 1.0)):
         ring = np.flatnonzero(np.abs(points[:, 2] - end) < 1e-9)
         scene.hold(shell, ring, motion=ddg.Motion(angle=lambda t, sign=sign: sign * RATE * t))
-    scene.contact(law=law, range=RANGE, **_touching.rubbing(friction, velocity=1e-2))
+    scene.contact(law=law, range=RANGE, **_many_rods.friction_options(friction, velocity=1e-2))
     return scene
 
 
@@ -72,6 +72,6 @@ def check(result) -> list[ddg.Check]:
     couples = np.array([result.series["couple"], result.series["couple_low"]])[:, 1:]
     ratio = float(couples[0].sum() / -couples[1].sum())
     return [
-        *_touching.checks(result),
+        *_many_rods.checks(result),
         ddg.Check("couples of both ends, mean over the run", ratio, 1.0, 0.05, "balance of moments", True),
     ]

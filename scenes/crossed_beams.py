@@ -8,7 +8,7 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.run.check import once_reached
-from ddg_warp.scenes import _touching
+from ddg_warp.scenes import _many_rods
 
 LENGTH = 1.0  # m
 RADIUS = 0.01  # m
@@ -59,7 +59,7 @@ def jittered(model, size: float, seed: int):
     """Return the beams at rest with inner nodes moved by up to `size` [m]."""
     points = np.concatenate([batch.points[0] for batch in model.scene.batches])
     inner = np.tile(np.pad(np.ones(len(points) // 2 - 2), 1), 2)[:, None]
-    return model.state(points=points + size * inner * _touching.jitter(points.shape, seed))
+    return model.state(points=points + size * inner * _many_rods.jitter(points.shape, seed))
 
 
 def observe(model, state) -> dict[str, float]:
@@ -80,7 +80,7 @@ def check(result) -> list[ddg.Check]:
     batch = result.model.scene.batches[0]
     names = ("force L^3 / (EI delta)", "deflection of the lower beam over delta", "action and reaction")
     checks = once_reached(result, result.model.scene.analysis.duration, names, lambda: _checks(result, batch, names))
-    return checks + _touching.kept_apart(result)
+    return checks + _many_rods.kept_apart(result)
 
 
 def _checks(result, batch, names) -> list[ddg.Check]:
@@ -105,4 +105,4 @@ def benchmark() -> ddg.bench.Study:
 def picture(result, frames) -> dict:
     """Draw the beams at the end with actual thickness."""
     last = max(frames)
-    return {"points_by_time": frames, "bodies": {last: _touching.tubes(result.model, frames[last])}}
+    return {"points_by_time": frames, "bodies": {last: _many_rods.tubes(result.model, frames[last])}}

@@ -18,7 +18,7 @@ import numpy as np
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.run.check import once_reached
-from ddg_warp.scenes import _touching
+from ddg_warp.scenes import _many_rods
 
 LENGTH = 1.0  # m
 RADIUS = 0.01  # m
@@ -60,7 +60,7 @@ def build(
     scene = ddg.Scene(
         gravity=(0.0, 0.0, 0.0),
         analysis=ddg.Statics(load_steps=load_steps),
-        initial=lambda model: _touching.jittered(model, seed),
+        initial=lambda model: _many_rods.jittered(model, seed),
     )
     points = np.zeros((n + 1, 3))
     points[:, 0], points[:, 2] = np.linspace(0.0, LENGTH, n + 1), RADIUS + CLOSE * range
@@ -95,8 +95,8 @@ def observe(model, state) -> dict[str, float]:
     return {
         "drawn": moved[-1],
         "crept": moved[0],
-        "force": pull / (model.scene.touching.friction * WEIGHT * LENGTH),
-        "gap": _touching.smallest_gap(model, state),
+        "force": pull / (model.scene.contact_parameters.friction * WEIGHT * LENGTH),
+        "gap": _many_rods.smallest_gap(model, state),
     }
 
 
@@ -114,7 +114,7 @@ def check(result) -> list[ddg.Check]:
 def _checks(result, names) -> list[ddg.Check]:
     times, series = np.array(result.times), {name: np.array(values) for name, values in result.series.items()}
     exact = np.array([expected(u, t > TURN + 1e-9) for t, u in zip(times, series["drawn"], strict=True)])
-    turn, velocity = int(np.argmax(series["drawn"])), result.model.scene.touching.velocity
+    turn, velocity = int(np.argmax(series["drawn"])), result.model.scene.contact_parameters.velocity
     errors, crept = np.abs(series["force"] - exact)[times > LAID + 1e-9], series["crept"][times > LAID - 1e-9]
     n = result.model.curves.counts[0] - 1
     return [

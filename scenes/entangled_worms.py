@@ -10,7 +10,7 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.run.check import once_reached
-from ddg_warp.scenes import _layouts, _touching
+from ddg_warp.scenes import _layouts, _many_rods
 
 LENGTH = 0.15  # m
 RADIUS = 1.5e-3  # m
@@ -89,18 +89,18 @@ def bundle(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def observe(model, state) -> dict[str, float]:
-    """Return `_touching.observe` with total contact force [N], momentum [N s], radius of gyration [m], and number of blobs.
+    """Return `_many_rods.observe` with total contact force [N], momentum [N s], radius of gyration [m], and number of blobs.
 
     The total contact force is the sum of magnitudes over all pairs; a blob is a connected component of worms in contact.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    points, contacts, worms = state.points(), model.contacts(state), _touching.rods_of(model)
+    points, contacts, worms = state.points(), model.contacts(state), _many_rods.rods_of(model)
     touching = coo_array((np.ones(len(contacts)), contacts.objects.T), shape=(worms, worms))
-    return _touching.observe(model, state) | {
+    return _many_rods.observe(model, state) | {
         "pushed": float(np.linalg.norm(contacts.force, axis=1).sum()),
-        "drift": float(np.linalg.norm(_touching.momentum(model, state))),
+        "drift": float(np.linalg.norm(_many_rods.momentum(model, state))),
         "gyration": float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean())),
         "blobs": float(connected_components(touching, directed=False)[0]),
     }
@@ -115,14 +115,14 @@ def check(result) -> list[ddg.Check]:
     )
     momentum = max(result.series["drift"]) / (result.dt * np.sum(result.series["pushed"]))
     return [
-        *_touching.checks(result),
+        *_many_rods.checks(result),
         ddg.Check("momentum over all that worms exchange", momentum, 0.0, 1e-6, "actio is reactio"),
         *once_reached(result, WINDS, names, lambda: _checks(result, names)),
     ]
 
 
 def _checks(result, names) -> list[ddg.Check]:
-    worms, final = _touching.rods_of(result.model), slice(-max(1, len(result.times) // 10), None)
+    worms, final = _many_rods.rods_of(result.model), slice(-max(1, len(result.times) // 10), None)
     # largest number of contacts between n equal disks in a plane
     most = np.floor(3.0 * worms - np.sqrt(12.0 * worms - 3.0))
     pairs, size = np.mean(result.series["touching_rods"][final]), result.series["gyration"]
@@ -150,7 +150,7 @@ def picture(result, frames) -> dict:
     times = times[0], times[len(times) // 3], times[-1]
     return {
         "points_by_time": {t: frames[t] for t in times},
-        "bodies": {t: _touching.colored_tubes(result.model, frames[t]) for t in times},
+        "bodies": {t: _many_rods.colored_tubes(result.model, frames[t]) for t in times},
         "lines": False,
         "side_by_side": True,
     }

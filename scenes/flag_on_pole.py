@@ -10,7 +10,7 @@ import numpy as np
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.run.check import once_reached
-from ddg_warp.scenes import _touching
+from ddg_warp.scenes import _many_rods
 
 WIDTH, HEIGHT = 0.6, 0.4  # m, of the flag
 THICKNESS = 2e-3  # m
@@ -45,7 +45,7 @@ def build(
     points, triangles = meshes.rectangle(along, cells, (WIDTH, HEIGHT), "alternating")
     points = points[:, [0, 2, 1]] + [APART, 0.0, -0.5 * HEIGHT]
     hoist = np.flatnonzero(points[:, 0] < APART + 1e-9)
-    start = points + 0.1 * RANGE * _touching.jitter((len(points), 1), seed) * [0.0, 1.0, 0.0]
+    start = points + 0.1 * RANGE * _many_rods.jitter((len(points), 1), seed) * [0.0, 1.0, 0.0]
     scene = ddg.Scene(mass_damping=damping, analysis=ddg.Dynamics(dt=dt, duration=duration))
     flag = scene.add_shell(start, triangles, thickness=THICKNESS, material=CLOTH, bending="hinge", name="flag")
     line = start[hoist[np.argsort(points[hoist, 2])]]
@@ -63,7 +63,7 @@ def build(
         force = shares(points, triangles)[:, None] * wind * 9.81 * CLOTH.density * THICKNESS * axis
         scene.add_vertex_force(flag, np.arange(len(points)), force, amplitude=lambda t, k=k: float(blowing(t)[k]))
     scene.add_obstacle(ddg.Capsule((0.0, 0.0, -HEIGHT), (0.0, 0.0, HEIGHT), POLE), name="pole")
-    scene.contact(range=RANGE, **_touching.rubbing(friction, velocity=1e-2))
+    scene.contact(range=RANGE, **_many_rods.friction_options(friction, velocity=1e-2))
     return scene
 
 
@@ -81,8 +81,8 @@ def blowing(t: float) -> np.ndarray:
 
 
 def observe(model, state) -> dict[str, float]:
-    """Return `_touching.observe` with the force on pole and rope, direction of the flag [rad], and self-contact pairs."""
-    observed, pairs = _touching.observe(model, state), model.contacts(state).objects
+    """Return `_many_rods.observe` with the force on pole and rope, direction of the flag [rad], and self-contact pairs."""
+    observed, pairs = _many_rods.observe(model, state), model.contacts(state).objects
     flag = state.points().reshape(-1, 3)[model.scene.batches[0].nodes :].mean(0)
     return observed | {
         "carried": float(sum(np.reshape(each.force, (-1, 3))[0, 2] for each in model.reactions(state))),
@@ -99,7 +99,7 @@ def check(result) -> list[ddg.Check]:
         "force less inertia over weight",
     )
     end = result.model.scene.analysis.duration
-    return _touching.checks(result) + once_reached(result, end, names, lambda: _checks(result, names))
+    return _many_rods.checks(result) + once_reached(result, end, names, lambda: _checks(result, names))
 
 
 def _checks(result, names) -> list[ddg.Check]:
@@ -109,7 +109,7 @@ def _checks(result, names) -> list[ddg.Check]:
     return [
         ddg.Check(names[0], direction[blown].mean(), np.pi, 0.3, "downwind"),
         ddg.Check(names[1], float(touched), 1.0, 0.0, "as it is blown, and as it falls"),
-        _touching.weight_check(result, 0.02),
+        _many_rods.weight_check(result, 0.02),
     ]
 
 

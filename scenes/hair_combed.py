@@ -9,7 +9,7 @@ comb is smooth; there is friction between strands.
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.scenes import _layouts, _touching
+from ddg_warp.scenes import _layouts, _many_rods
 
 LENGTH = 0.12  # m
 RADIUS, TOOTH = 4e-4, 1e-3  # m, of strands and teeth
@@ -78,16 +78,16 @@ def curled(gaps: int, rows: int, n: int, random) -> np.ndarray:
 
 
 def observe(model, state) -> dict[str, float]:
-    """Return `_touching.observe` with the upward force of the comb [N], strands in a wrong gap, and forces on the hair [N].
+    """Return `_many_rods.observe` with the upward force of the comb [N], strands in a wrong gap, and forces on the hair [N].
 
     Components of the force of roots and comb, weight included, and of the momentum [N s] are named `force_k` and `momentum_k`.
     """
     roots, *comb = (np.array(reaction.force) for reaction in model.reactions(state))
-    forces = sum(comb) + roots + _touching.mass(model) * np.array(model.scene.gravity)
-    momentum = _touching.momentum(model, state)
+    forces = sum(comb) + roots + _many_rods.mass(model) * np.array(model.scene.gravity)
+    momentum = _many_rods.momentum(model, state)
     parts = {f"{n}_{k}": float(v[k]) for n, v in (("force", forces), ("momentum", momentum)) for k in range(3)}
     return (
-        _touching.observe(model, state) | parts | {"comb": float(sum(comb)[2]), "astray": float(astray(model, state))}
+        _many_rods.observe(model, state) | parts | {"comb": float(sum(comb)[2]), "astray": float(astray(model, state))}
     )
 
 
@@ -98,7 +98,7 @@ def comb_at(model, t: float) -> float:
 
 def astray(model, state) -> int:
     """Return the number of strand crossings of the comb's height in a gap other than at the root."""
-    points, gaps = state.points().reshape(_touching.rods_of(model), -1, 3), len(model.scene.obstacles) - 1
+    points, gaps = state.points().reshape(_many_rods.rods_of(model), -1, 3), len(model.scene.obstacles) - 1
     above = points[..., 2] - comb_at(model, state.time)
     rod, edge = np.nonzero(above[:, :-1] * above[:, 1:] <= 0.0)
     weight = above[rod, edge] / (above[rod, edge] - above[rod, edge + 1])
@@ -112,14 +112,14 @@ def check(result) -> list[ddg.Check]:
     series = {name: np.array(values) for name, values in result.series.items()}
     force, momentum = (np.stack([series[f"{name}_{k}"] for k in range(3)], axis=1) for name in ("force", "momentum"))
     inertia = np.diff(momentum, axis=0) / np.diff(times)[:, None] + model.scene.mass_damping * momentum[1:]
-    off = np.linalg.norm(force[1:] - inertia, axis=1) / _touching.weight(model)
+    off = np.linalg.norm(force[1:] - inertia, axis=1) / _many_rods.weight(model)
     # a step of several substeps ends with the force of the last one
     whole = np.sort(off)[: max(1, len(off) - result.statistics["retries"])]
     displacement = np.diff([comb_at(model, t) for t in times])
     return [
-        *_touching.checks(result),
+        *_many_rods.checks(result),
         ddg.Check("forces less inertia over the weight", whole.max(), 0.0, 1e-5, "Newton"),
-        _touching.energy_check(result, np.append(0.0, np.cumsum(series["comb"][1:] * displacement)), 2e-3),
+        _many_rods.energy_check(result, np.append(0.0, np.cumsum(series["comb"][1:] * displacement)), 2e-3),
         ddg.Check("strands in another gap than their roots", series["astray"].max(), 0.0, 0.0, "teeth part the hair"),
     ]
 
@@ -141,7 +141,7 @@ def picture(result, frames) -> dict:
     times = times[0], times[len(times) // 2], times[-1]
     return {
         "points_by_time": {t: frames[t] for t in times},
-        "bodies": {t: _touching.colored_tubes(result.model, frames[t], t) for t in times},
+        "bodies": {t: _many_rods.colored_tubes(result.model, frames[t], t) for t in times},
         "lines": False,
         "side_by_side": True,
     }

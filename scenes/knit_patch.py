@@ -16,7 +16,7 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.run.check import once_reached
-from ddg_warp.scenes import _touching
+from ddg_warp.scenes import _many_rods
 
 STITCH = 8e-3  # m, its width
 UNIT = STITCH / (2.0 * np.pi)  # m, u
@@ -58,7 +58,7 @@ def build(
         gravity=(0.0, 0.0, 0.0),
         mass_damping=damping,
         analysis=ddg.Dynamics(dt=dt, duration=LASTS),
-        initial=lambda model: _touching.jittered(model, seed),
+        initial=lambda model: _many_rods.jittered(model, seed),
     )
     yarn = scene.add_rod(points, section=ddg.Circle(RADIUS), material=YARN, name="yarn")
     for nodes, sign in ((feet, -1.0), (heads, 1.0)):
@@ -86,12 +86,12 @@ def knitted(rows: int, columns: int, n: int) -> tuple[np.ndarray, np.ndarray, np
 
 
 def observe(model, state) -> dict[str, float]:
-    """Return `_touching.observe` with pulls of both grips along z [N], and width of the patch over the initial one.
+    """Return `_many_rods.observe` with pulls of both grips along z [N], and width of the patch over the initial one.
 
     The width is the standard deviation of x of all nodes.
     """
     low, high = model.reactions(state)
-    return _touching.observe(model, state) | {
+    return _many_rods.observe(model, state) | {
         "low": float(low.force[2]),
         "high": float(high.force[2]),
         "width": float(state.points()[:, 0].std() / model.scene.batches[0].points[0, :, 0].std()),
@@ -107,8 +107,8 @@ def check(result) -> list[ddg.Check]:
     settled = np.array(result.times) > 0.1 * LASTS  # without the transient of the jitter
     balance = np.abs(series["high"] + series["low"])[settled].max() / series["high"][settled].max()
     return [
-        *_touching.checks(result),
-        _touching.energy_check(result, work),
+        *_many_rods.checks(result),
+        _many_rods.energy_check(result, work),
         ddg.Check("pulls of both grips, their sum over the largest", balance, 0.0, 0.01, "balance of forces"),
         *once_reached(result, LASTS, names, lambda: _checks(series, 2.0 * displacement[-1] / height(model), names)),
     ]
@@ -143,7 +143,7 @@ def picture(result, frames) -> dict:
     times = min(frames), max(frames)
     return {
         "points_by_time": {t: frames[t] for t in times},
-        "bodies": {t: _touching.colored_tubes(result.model, frames[t]) for t in times},
+        "bodies": {t: _many_rods.colored_tubes(result.model, frames[t]) for t in times},
         "lines": False,
         "side_by_side": True,
     }

@@ -8,7 +8,7 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
-from ddg_warp.scenes import _touching
+from ddg_warp.scenes import _many_rods
 
 EDGE = 5e-3  # m
 SPACING = 0.05  # m, between strands
@@ -62,7 +62,7 @@ def build(
     points[..., :2] += bow[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)[:, None]
     scene = ddg.Scene(
         analysis=ddg.Dynamics(dt=dt, duration=duration, rtol=RTOL),
-        initial=lambda model: _touching.jittered(model, seed),
+        initial=lambda model: _many_rods.jittered(model, seed),
     )
     scene.add_rods(
         points,
@@ -86,8 +86,8 @@ def build(
 
 
 def observe(model, state) -> dict[str, float]:
-    """Return `_touching.observe` with the largest distance of nodes from the centre of the bowl [m]."""
-    observed = _touching.observe(model, state)
+    """Return `_many_rods.observe` with the largest distance of nodes from the centre of the bowl [m]."""
+    observed = _many_rods.observe(model, state)
     return {**observed, "farthest": float(np.linalg.norm(below(state.points()), axis=1).max(initial=0.0))}
 
 
@@ -101,9 +101,9 @@ def check(result) -> list[ddg.Check]:
     bowl = float(np.abs(result.model.scene.obstacles[0].shape.points[:, 2]).max())
     inside = max(result.series["farthest"]) / (bowl - RADIUS)
     return [
-        *_touching.checks(result),
-        _touching.weight_check(result, FRICTION),
-        _touching.energy_check(result),
+        *_many_rods.checks(result),
+        _many_rods.weight_check(result, FRICTION),
+        _many_rods.energy_check(result),
         ddg.Check("farthest node below the rim over the bowl's radius", inside, 0.0, 1.0, "the bowl has no hole"),
     ]
 
@@ -128,6 +128,6 @@ def picture(result, frames) -> dict:
     return {
         "points_by_time": {t: frames[t] for t in times},
         "bodies": {t: (shape.points, shape.cells[back]) for t in times},
-        "colors": _touching.colors(result.model),
+        "colors": _many_rods.colors(result.model),
         "side_by_side": True,
     }

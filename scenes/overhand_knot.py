@@ -26,7 +26,7 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.run.check import once_reached
-from ddg_warp.scenes import _knots, _touching
+from ddg_warp.scenes import _knots, _many_rods
 
 RADIUS = 1e-3  # m
 B = 1e-4  # N m^2
@@ -83,7 +83,7 @@ def build(
         gravity=(0.0, 0.0, 0.0),
         analysis=ddg.Dynamics(dt=STEP_TIME, duration=duration),
         initial=lambda model: model.state(
-            points=points + 0.05 * RANGE * _inner(points) * _touching.jitter(points.shape, seed)
+            points=points + 0.05 * RANGE * _inner(points) * _many_rods.jitter(points.shape, seed)
         ),
     )
     speed = np.pi * R * np.log(tighter) / duration
@@ -142,18 +142,18 @@ def observe(model, state) -> dict[str, float]:
         "normal": forces.sum(),
         "radius": slack / (2.0 * np.pi),
         "half": RADIUS + 0.5 * float((forces * contacts.gap).sum() / max(forces.sum(), 1e-300)),
-        "gap": _touching.smallest_gap(model, state),
+        "gap": _many_rods.smallest_gap(model, state),
     }
 
 
 def check(result) -> list[ddg.Check]:
     """Check traction against the loose knot, normal force against its limit, and both laws of long braids."""
     checks = once_reached(result, result.model.scene.analysis.duration, NAMES, lambda: _checks(result))
-    return checks + _touching.kept_apart(result)
+    return checks + _many_rods.kept_apart(result)
 
 
 def _checks(result) -> list[ddg.Check]:
-    friction, times = result.model.scene.touching.friction, np.array(result.times)
+    friction, times = result.model.scene.contact_parameters.friction, np.array(result.times)
     R, traction, normal, h = (np.array(result.series[k]) for k in ("radius", "traction", "normal", "half"))
     n = round(float(np.sqrt(R[0] / RADIUS / LOOSE)))
     epsilon, traction, normal = np.sqrt(h / R), traction * h**2 / B, normal * h**2 / B

@@ -15,7 +15,7 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.run.check import once_reached
-from ddg_warp.scenes import _touching
+from ddg_warp.scenes import _many_rods
 
 RADIUS = 1e-3  # m
 B = 1e-4  # N m^2
@@ -64,7 +64,7 @@ def build(
     scene = ddg.Scene(
         gravity=(0.0, 0.0, 0.0),
         analysis=ddg.Dynamics(dt=STEP_TIME, duration=duration),
-        initial=lambda model: model.state(points=points + 0.1 * RANGE * free * _touching.jitter(points.shape, seed)),
+        initial=lambda model: model.state(points=points + 0.1 * RANGE * free * _many_rods.jitter(points.shape, seed)),
     )
     section = ddg.Stiffness(
         EA=STIFF * B / RADIUS**2,
@@ -135,7 +135,7 @@ def observe(model, state) -> dict[str, float]:
         "torque": abs(np.reshape(reactions[2].moment, (-1, 3))[0, 0]),
         "tension": abs(np.reshape(reactions[0].force, (-1, 3))[0, 0]),
         "half": RADIUS + 0.5 * float((forces * contacts.gap).sum() / max(forces.sum(), 1e-300)),
-        "gap": _touching.smallest_gap(model, state),
+        "gap": _many_rods.smallest_gap(model, state),
         "angle": angle,
         "radius": radius,
         "length": float(np.ptp(contacts.point @ axis)) if len(contacts.point) else 0.0,
@@ -162,7 +162,7 @@ def check(result) -> list[ddg.Check]:
         "radius over that of contact",
     )
     checks = once_reached(result, result.model.scene.analysis.duration, names, lambda: _checks(result, names))
-    return checks + _touching.kept_apart(result)
+    return checks + _many_rods.kept_apart(result)
 
 
 def _checks(result, names) -> list[ddg.Check]:

@@ -11,7 +11,7 @@ import numpy as np
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.run.check import once_reached
-from ddg_warp.scenes import _touching
+from ddg_warp.scenes import _many_rods
 
 LENGTH = 0.3  # m
 RADIUS = 0.005  # m
@@ -62,7 +62,7 @@ def build(
         analysis=ddg.Dynamics(dt=dt, duration=duration),
         initial=lambda model: thrown(model, speed * down),
     )
-    jitter = _touching.jitter((len(NAMES), 3), seed)
+    jitter = _many_rods.jitter((len(NAMES), 3), seed)
     s = np.linspace(0.0, LENGTH, n + 1)[:, None]
     for k, name in enumerate(NAMES):
         lean = (LEAN if name == "rests" else 0.0) * (1.0 + 0.3 * jitter[k, 0])
@@ -112,7 +112,7 @@ def observe(model, state) -> dict[str, float]:
     normal = np.array(model.scene.obstacles[0].shape.normal)
     weight = sum(batch.section.mass_per_length for batch in model.scene.batches) * LENGTH * GRAVITY * normal[2]
     carried = np.reshape(model.reactions(state)[-1].force, (-1, 3))[0] @ normal
-    return ways(model, state) | {"gap": _touching.smallest_gap(model, state), "carried": float(carried / weight)}
+    return ways(model, state) | {"gap": _many_rods.smallest_gap(model, state), "carried": float(carried / weight)}
 
 
 def check(result) -> list[ddg.Check]:
@@ -125,13 +125,13 @@ def check(result) -> list[ddg.Check]:
     )
     scene = result.model.scene
     checks = once_reached(result, scene.analysis.duration, names, lambda: _checks(result, scene, names))
-    return checks + _touching.kept_apart(result)
+    return checks + _many_rods.kept_apart(result)
 
 
 def _checks(result, scene, names) -> list[ddg.Check]:
     normal = np.array(scene.obstacles[0].shape.normal)
     tangent, cosine = normal[0] / normal[2], normal[2]
-    law, slippery = scene.touching, scene.betweens[0].friction
+    law, slippery = scene.contact_parameters, scene.betweens[0].friction
     speed = np.linalg.norm(scene.initial(result.model).velocities().reshape(-1, 3), axis=-1).max()
     series = {name: np.array(values) for name, values in result.series.items()}
     t, settled = np.array(result.times), np.array(result.times) > SETTLED * result.times[-1]
@@ -174,5 +174,5 @@ def picture(result, frames) -> dict:
     floor = x * down + y * across
     return {
         "points_by_time": frames,
-        "bodies": {min(frames): (floor, cells)} | {last: _touching.tubes(result.model, points)},
+        "bodies": {min(frames): (floor, cells)} | {last: _many_rods.tubes(result.model, points)},
     }

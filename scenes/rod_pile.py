@@ -10,7 +10,7 @@ not compared.
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.scenes import _layouts, _touching
+from ddg_warp.scenes import _layouts, _many_rods
 
 LENGTH = 0.1  # m
 RADIUS = 1e-3  # m; L / D = 50
@@ -62,7 +62,7 @@ def build(
         name="rods",
     )
     # Measured: stiffer contact and friction, for this speed of fall, take twice the iterations.
-    scene.contact(stiffness=SOFT * young, **_touching.rubbing(friction, velocity=SLIP))
+    scene.contact(stiffness=SOFT * young, **_many_rods.friction_options(friction, velocity=SLIP))
     scene.add_obstacle(ddg.Plane(), name="floor")
     for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         wall = ddg.Plane((0.5 * width * (1 - x), 0.5 * width * (1 - y), 0.0), (x, y, 0.0))
@@ -72,14 +72,14 @@ def build(
 
 
 def observe(model, state) -> dict[str, float]:
-    """Return `_touching.observe` with height of the pile, twice that of its centre [m], phi L / D, and contacts a rod."""
-    observed = _touching.observe(model, state)
+    """Return `_many_rods.observe` with height of the pile, twice that of its centre [m], phi L / D, and contacts a rod."""
+    observed = _many_rods.observe(model, state)
     points, walls = state.points(), np.array([each.shape.points[0] for each in model.scene.obstacles[1:]])
     height = 2.0 * float(points[:, 2].mean())
     fraction = (
-        _touching.rods_of(model) * np.pi * RADIUS**2 * LENGTH / (np.ptp(walls[:, 0]) * np.ptp(walls[:, 1]) * height)
+        _many_rods.rods_of(model) * np.pi * RADIUS**2 * LENGTH / (np.ptp(walls[:, 0]) * np.ptp(walls[:, 1]) * height)
     )
-    contacts = 2.0 * observed["touching_rods"] / _touching.rods_of(model)
+    contacts = 2.0 * observed["touching_rods"] / _many_rods.rods_of(model)
     return {**observed, "height": height, "packing": fraction * LENGTH / (2.0 * RADIUS), "contacts_per_rod": contacts}
 
 
@@ -88,9 +88,9 @@ def check(result) -> list[ddg.Check]:
     series = {name: values[-1] for name, values in result.series.items()}
     fraction = series["packing"] * 2.0 * RADIUS / LENGTH
     checks = [
-        *_touching.checks(result, REFUSED),
-        _touching.weight_check(result, 1e-3),
-        _touching.energy_check(result),
+        *_many_rods.checks(result, REFUSED),
+        _many_rods.weight_check(result, 1e-3),
+        _many_rods.energy_check(result),
         ddg.Check("rods outside of the box [m]", outside(result), 0.0, 0.0, "floor and walls"),
         ddg.Check("packing fraction over that of cylinders side by side", fraction / DENSEST, 0.0, 1.0, "Thue 1910"),
     ]
@@ -123,6 +123,6 @@ def picture(result, frames) -> dict:
     times = list(frames)
     return {
         "points_by_time": {t: frames[t] for t in (times[0], times[len(times) // 3], times[-1])},
-        "colors": _touching.colors(result.model),
+        "colors": _many_rods.colors(result.model),
         "side_by_side": True,
     }

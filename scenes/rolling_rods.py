@@ -9,7 +9,7 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.run.check import once_reached
-from ddg_warp.scenes import _touching, rod_on_floor
+from ddg_warp.scenes import _many_rods, rod_on_floor
 
 LENGTH = 0.1  # m
 RADIUS = 0.005  # m
@@ -62,7 +62,7 @@ def build(
         analysis=ddg.Dynamics(dt=dt, duration=duration),
         initial=lambda model: rod_on_floor.thrown(model, speed * down, "bowled"),
     )
-    jitter = _touching.jitter((len(NAMES), 2), seed)
+    jitter = _many_rods.jitter((len(NAMES), 2), seed)
     along = np.outer(np.linspace(-0.5, 0.5, n + 1) * LENGTH, [0.0, 1.0, 0.0])
     for k, name in enumerate(NAMES):
         start = k * LANE * np.array([0.0, 1.0, 0.0]) + 0.1 * RADIUS * jitter[k, 0] * down
@@ -91,7 +91,7 @@ def observe(model, state) -> dict[str, float]:
     rotations = (state.angles() - model.state().angles()).reshape(-1, len(NAMES), edges)[0].mean(1)
     observed = rod_on_floor.ways(model, state)
     observed |= {f"{name}, turned": RADIUS * value for name, value in zip(NAMES, rotations, strict=True)}
-    return observed | {"gap": _touching.smallest_gap(model, state)}
+    return observed | {"gap": _many_rods.smallest_gap(model, state)}
 
 
 def expected(angle: float, friction: float, speed: float, t: float) -> tuple[float, float]:
@@ -107,11 +107,11 @@ def check(result) -> list[ddg.Check]:
     """Check displacements of rods, and of surfaces about the axes."""
     scene = result.model.scene
     checks = once_reached(result, scene.analysis.duration, WAYS, lambda: _checks(result, scene))
-    return checks + _touching.kept_apart(result)
+    return checks + _many_rods.kept_apart(result)
 
 
 def _checks(result, scene) -> list[ddg.Check]:
-    normal, mu = np.array(scene.obstacles[0].shape.normal), scene.touching.friction
+    normal, mu = np.array(scene.obstacles[0].shape.normal), scene.contact_parameters.friction
     speed = np.linalg.norm(scene.initial(result.model).velocities().reshape(-1, 3), axis=-1).max()
     inputs = {"rolls": (mu, 0.0), "bowled": (mu, speed), "slips": (scene.betweens[0].friction, 0.0)}
     exact = [expected(np.arctan2(normal[0], normal[2]), *inputs[name], result.times[-1]) for name in NAMES]

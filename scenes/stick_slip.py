@@ -10,7 +10,7 @@ import numpy as np
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.run.check import once_reached
-from ddg_warp.scenes import _touching
+from ddg_warp.scenes import _many_rods
 
 LENGTH = 1.0  # m
 RADIUS = 0.002  # m
@@ -72,7 +72,7 @@ def build(
     displacement = BEYOND * SLIP[friction][0] * LENGTH
     scene.clamp_end(rod, "first", motion=ddg.Motion(translation=lambda t: (0.0, 0.0, -displacement * t / duration)))
     fades = min(1.0, NUDGED * LENGTH / displacement) * duration
-    nudge = NUDGE * (1.0 + 0.5 * float(_touching.jitter((), seed)))
+    nudge = NUDGE * (1.0 + 0.5 * float(_many_rods.jitter((), seed)))
     scene.add_force(rod, n // 2, (nudge, 0.0, 0.0), amplitude=lambda t: max(0.0, 1.0 - t / fades))
     scene.add_obstacle(ddg.Plane(), name="floor")
     scene.contact(
@@ -97,7 +97,7 @@ def observe(model, state) -> dict[str, float]:
 
 def check(result) -> list[ddg.Check]:
     """Check delta of the slip, forces there and before, and creep until then."""
-    mu, law = result.model.scene.touching.friction, result.model.scene.touching
+    mu, law = result.model.scene.contact_parameters.friction, result.model.scene.contact_parameters
     series = {name: np.array(values) for name, values in result.series.items()}
     slips = np.flatnonzero(series["tip_speed"] * LENGTH > law.velocity)
     where, normal = SLIP[mu]
@@ -110,13 +110,13 @@ def check(result) -> list[ddg.Check]:
         names,
         lambda: _checks(result, series, slips, (where, normal, sticks), names),
     )
-    return checks + _touching.kept_apart(result)
+    return checks + _many_rods.kept_apart(result)
 
 
 def _checks(result, series, slips, reference, names) -> list[ddg.Check]:
     where, normal, sticks = reference
     first = slips[0] if len(slips) else -1
-    mu, law = result.model.scene.touching.friction, result.model.scene.touching
+    mu, law = result.model.scene.contact_parameters.friction, result.model.scene.contact_parameters
     ratio = series["tangential"] / np.maximum(series["normal"], 1e-12)
     previous = max(first - 1, 0)
     # the tangential force reaches its bound within the step before the first slipping one

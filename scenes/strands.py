@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.scenes import _layouts, _strands, _touching
+from ddg_warp.scenes import _layouts, _many_rods, _strands
 
 GROOM = Path(__file__).resolve().parent / "data" / "strands.usdc"
 PERIOD = 1.0  # s, of the head's motion
@@ -60,7 +60,7 @@ def build(
     points, radius = groom(path, count)
     thin = radius * min(1.0, np.sqrt(CROWD / count))
     # strands jittered out of these shapes would stretch tens of times more than by weight and motion
-    points[:, HELD:] += 0.2 * thin * _touching.jitter(points[:, HELD:].shape, seed)
+    points[:, HELD:] += 0.2 * thin * _many_rods.jitter(points[:, HELD:].shape, seed)
     distance = 2.0 * thin * (1.0 + CLEAR)  # distance of centrelines at the start
     if contact:
         points = _layouts.resolve_overlaps(points, distance, held=HELD)
@@ -144,9 +144,9 @@ def head_motion(points: np.ndarray, sway: float) -> ddg.Motion:
 
 
 def observe(model, state) -> dict[str, float]:
-    """Return `_strands.observe`, and `_touching.observe` with contact."""
+    """Return `_strands.observe`, and `_many_rods.observe` with contact."""
     observed = _strands.observe(model, state)
-    return {**_touching.observe(model, state), **observed} if model.scene.touching else observed
+    return {**_many_rods.observe(model, state), **observed} if model.scene.contact_parameters else observed
 
 
 def check(result) -> list[ddg.Check]:
@@ -154,11 +154,11 @@ def check(result) -> list[ddg.Check]:
 
     With contact, check also that nothing interpenetrates.
     """
-    if not result.model.scene.touching:
+    if not result.model.scene.contact_parameters:
         return _strands.checks(result, 1e-3, "weight and inertia over EA")
     stopped = _strands.stopped(result) / (result.dt * result.model.scene.batches[0].section.EA)
     checks = _strands.checks(result, stopped, "a strand at top speed that is stopped in a step, over EA")
-    return [*_touching.checks(result, REFUSED), *checks[2:]]  # rejected steps are allowed
+    return [*_many_rods.checks(result, REFUSED), *checks[2:]]  # rejected steps are allowed
 
 
 def benchmark() -> ddg.bench.Study:

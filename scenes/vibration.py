@@ -89,7 +89,9 @@ def modes(model, state, count: int = 24) -> dict[str, tuple[np.ndarray, np.ndarr
 
     tangent = Tangent(model)
     eigen = spectrum(model, state, count, tangent=tangent)
-    nodes = slice(int(model.chains[0].first[0]), int(model.chains[0].first[0] + model.chains[0].own[0]))
+    nodes = slice(
+        int(model.rod_group_data[0].first[0]), int(model.rod_group_data[0].first[0] + model.rod_group_data[0].own[0])
+    )
     shapes = eigen.modes.reshape(-1, 4, eigen.modes.shape[1])
     # fractions of kinetic energy of x, y, z and the twist angle
     fractions = (tangent.mass.reshape(-1, 4)[..., None] * shapes**2).sum(axis=0)

@@ -14,7 +14,7 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.run.check import once_reached
-from ddg_warp.scenes import _touching
+from ddg_warp.scenes import _many_rods
 
 LENGTH = 0.3  # m
 RADIUS = 5e-3  # m
@@ -53,7 +53,7 @@ def build(
         initial=lambda model: actuate(model, 0.0) or model.state(),
         callbacks=[lambda state: actuate(state.model, state.time)],
     )
-    jitter = _touching.jitter((len(NAMES), 3), seed)
+    jitter = _many_rods.jitter((len(NAMES), 3), seed)
     x = np.linspace(0.0, LENGTH, n + 1)
     for k, name in enumerate(NAMES):
         shift = np.array([0.0, LANE * k, RADIUS + 1.01 * RANGE]) + jitter[k] * [0.01, 0.01, 5e-3 * RANGE]
@@ -88,7 +88,7 @@ def observe(model, state) -> dict[str, float]:
     weight = sum(batch.section.mass_per_length for batch in model.scene.batches) * LENGTH * 9.81
     carried = np.reshape(model.reactions(state)[-1].force, (-1, 3))[0, 2]
     positions = {name: float(0.5 * (x[1:] + x[:-1]).mean()) for name, x in zip(NAMES, middles, strict=True)}
-    return positions | {"gap": _touching.smallest_gap(model, state), "carried": float(carried / weight)}
+    return positions | {"gap": _many_rods.smallest_gap(model, state), "carried": float(carried / weight)}
 
 
 def advance(name: str, coefficients, segments: int = 120, steps: int = 200) -> float:
@@ -151,14 +151,14 @@ def check(result) -> list[ddg.Check]:
         "ground carries, over weight",
     )
     checks = once_reached(result, PERIODS * PERIOD, names, lambda: _checks(result, names))
-    return checks + _touching.kept_apart(result)
+    return checks + _many_rods.kept_apart(result)
 
 
 def _checks(result, names) -> list[ddg.Check]:
     scene = result.model.scene
     steps = round(PERIOD / result.dt)
     gone = {name: result.series[name][-1] - result.series[name][-1 - steps] for name in NAMES}
-    mu = scene.touching.friction
+    mu = scene.contact_parameters.friction
     carried = np.array(result.series["carried"][-steps:])
     return [
         ddg.Check(names[0], gone[SNAKE], advance(SNAKE, scene.betweens[0].friction), 0.02, BALANCE, True),
@@ -176,7 +176,7 @@ def benchmark() -> ddg.bench.Study:
 def picture(result, frames) -> dict:
     """Draw the crawlers from above, with actual thickness at the start and the end."""
     above = np.array([1.0, 1.0, 0.0])
-    bodies = {t: _touching.tubes(result.model, frames[t]) for t in (min(frames), max(frames))}
+    bodies = {t: _many_rods.tubes(result.model, frames[t]) for t in (min(frames), max(frames))}
     return {
         "points_by_time": {t: points * above for t, points in frames.items()},
         "bodies": {t: (points * above, cells) for t, (points, cells) in bodies.items()},

@@ -10,7 +10,7 @@ balance. Until buckling the tube is symmetric under half a rotation about an axi
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.scenes import _touching
+from ddg_warp.scenes import _many_rods
 
 CELL = 0.02  # m, initial distance of strands
 RADIUS = 1.5e-3  # m, of strands and rings
@@ -63,7 +63,7 @@ def build(
         gravity=(0.0, 0.0, 0.0),
         mass_damping=damping,
         analysis=ddg.Dynamics(dt=dt, duration=LASTS),
-        initial=lambda model: _touching.jittered(model, seed),
+        initial=lambda model: _many_rods.jittered(model, seed),
     )
     section = {"section": ddg.Circle(RADIUS), "material": THREAD}
     clamped = scene.add_rods(along, **section, name="strands")
@@ -104,7 +104,7 @@ def rings_of(model, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def observe(model, state) -> dict[str, float]:
-    """Return `_touching.observe` with couples [N m] and forces [N] of both ends, narrowest ring over the first, and asymmetry.
+    """Return `_many_rods.observe` with couples [N m] and forces [N] of both ends, narrowest ring over the first, and asymmetry.
 
     The asymmetry is the largest difference in radius and height between mirrored rings, over the radius.
     """
@@ -113,7 +113,7 @@ def observe(model, state) -> dict[str, float]:
     first = np.hypot(woven_as[..., 0], woven_as[..., 1]).mean()
     unlike = max(np.abs(radius - radius[::-1]).max(), np.abs(height + height[::-1]).max())
     ends = {f"{name}_{end}": float(getattr(r, name)[2]) for end, r in (("low", low), ("high", high)) for name in PARTS}
-    return _touching.observe(model, state) | ends | {"waist": radius.min() / first, "unlike": unlike / first}
+    return _many_rods.observe(model, state) | ends | {"waist": radius.min() / first, "unlike": unlike / first}
 
 
 def check(result) -> list[ddg.Check]:
@@ -127,8 +127,8 @@ def check(result) -> list[ddg.Check]:
     unlike = series["unlike"][series["waist"] > BUCKLED].max()
     narrowest = 1.0 - np.cos(angle[-1])
     return [
-        *_touching.checks(result),
-        _touching.energy_check(result, work),
+        *_many_rods.checks(result),
+        _many_rods.energy_check(result, work),
         ddg.Check("couples of both ends, their sum over the largest", couples, 0.0, 0.01, "balance of moments"),
         ddg.Check("forces of both ends, their sum over the largest", forces, 0.0, 0.01, "balance of forces"),
         ddg.Check("rings unlike their images about the middle, before they buckle", unlike, 0.0, 0.01, "symmetry"),
@@ -159,7 +159,7 @@ def picture(result, frames) -> dict:
     times = times[0], times[-2], times[-1]
     return {
         "points_by_time": {t: frames[t] for t in times},
-        "bodies": {t: _touching.colored_tubes(result.model, frames[t]) for t in times},
+        "bodies": {t: _many_rods.colored_tubes(result.model, frames[t]) for t in times},
         "lines": False,
         "side_by_side": True,
     }

@@ -270,6 +270,10 @@ def test_report_states_the_linear_solver_of_a_coupled_system(device, scene):
     newton = ddg.Integrator(model)._coupled.newton
     lines = model.report()
     assert ("exact" in lines) == newton.exact
-    bands = 3 * 16 * newton.chains.paths.longest * newton.chains.paths.columns if newton.chains else 0
+    bands = (
+        3 * 16 * newton.substructuring.paths.longest * newton.substructuring.paths.columns
+        if newton.substructuring
+        else 0
+    )
     assert f"{8 * (newton.system.matrix.size + bands) / 1e6:.3g} MB" in lines
     assert f"H: {newton.sparsity.entries} blocks" in lines

@@ -109,7 +109,7 @@ def test_edge_rotation_update_equals_a_walk_along_the_rods(device, anchors, clos
     results = []
     for _ in range(2):
         newton.iterates.q.assign(straight)
-        newton.turns.place(newton.iterates, newton.system, newton.islands)
+        newton.edge_rotations.place(newton.iterates, newton.system, newton.islands)
         results.append(newton.iterates.q.numpy().reshape(2, -1, 3))
     inputs = (values.reshape(2, -1, 3)[1] for values in (base, STEP_LENGTH * direction, straight))
     expected = updated(host, *inputs)

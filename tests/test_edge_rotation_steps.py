@@ -135,7 +135,7 @@ def test_midpoint_rule_is_stiff_by_half_the_step(device):
 @pytest.mark.parametrize(
     ("options", "psd"),
     [
-        ({"linear": "partitioned"}, "progressive"),
+        ({"linear": "cyclic_reduction"}, "progressive"),
         ({"solver": "projective"}, "gauss_newton"),
         ({"psd": "gauss_newton"}, "gauss_newton"),
         ({"psd": "none"}, "none"),

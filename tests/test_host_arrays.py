@@ -1,4 +1,4 @@
-"""Passes over host arrays on several cores: results of large arrays are those of small ones."""
+"""Passes over host arrays on several cores: results do not depend on the size of an array."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from ddg_warp import host_arrays
 
 @pytest.fixture(autouse=True)
 def small_passes_are_shared(monkeypatch):
-    """Share passes over all arrays."""
+    """Split passes over arrays of any size."""
     monkeypatch.setattr(host_arrays, "LARGE", 0)
 
 

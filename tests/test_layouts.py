@@ -30,7 +30,7 @@ def one_by_one(rng, count: int, size, height: float) -> np.ndarray:
 
 @pytest.mark.parametrize(("width", "seed", "batch"), [(1.5, 1, 1000), (1.0, 2, 1000), (1.2, 3, 40)])
 def test_placed_apart(monkeypatch, width, seed, batch):
-    """Trials that are tested together place the same rods, in boxes that grow and in several batches of neighbours."""
+    """Trials that are tested together give the same positions of rods, in boxes that grow and in several batches of neighbours."""
     monkeypatch.setattr(_layouts, "BATCH", batch)
     size = (width * LENGTH, width * LENGTH)
     expected = one_by_one(np.random.default_rng(seed), 150, size, 0.25 * LENGTH)

@@ -245,7 +245,7 @@ def test_sums_over_ranges(device):
     accounts = []
     for ranges in (1, 3):
         integrator, end = ddg.Integrator(model, "implicit_midpoint"), state
-        drift = integrator._chains[0].energy
+        drift = integrator._rod_steps[0].energy
         drift.ranges, drift.sums = ranges, wp.zeros((2 * ranges, 4, 1), dtype=wp.float64, device=device)
         drift.rows = drift.sums.transpose((1, 0, 2))
         for _ in range(5):

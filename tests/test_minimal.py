@@ -64,7 +64,7 @@ def test_springs_have_no_angles_and_no_frames(device):
     for name in ("theta", "omega", "frame", "last"):
         assert getattr(data, name).size == 1, name  # a placeholder for kernel signatures
     assert data.x.shape == data.v.shape == (6, 1)
-    newton = integrator._chains[0].newton
+    newton = integrator._rod_steps[0].newton
     assert newton.direction.shape[0] == 3
     assert newton.elimination.shape[0] == 2 * 9 + 3
     assert newton.theta.size == newton.target_angle.size == 1

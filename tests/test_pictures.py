@@ -9,7 +9,7 @@ from ddg_warp.run import figure
 from ddg_warp.run.cli import main
 from ddg_warp.run.scene_registry import load_scene, one_liner, scene_files
 from ddg_warp.run.simulate import simulate
-from ddg_warp.scenes import _touching
+from ddg_warp.scenes import _many_rods
 
 
 @pytest.fixture
@@ -131,10 +131,10 @@ def test_rods_are_drawn_as_tubes(drawn):
     scene.add_obstacle(ddg.Capsule((0, 0, 3), (1, 0, 3), 0.1), motion=ddg.Motion(translation=lambda t: (0.0, 0.0, t)))
     scene.contact()
     model = scene.build("cpu")
-    points, triangles, colors = _touching.colored_tubes(model, model.state().points(), t=2.0)
+    points, triangles, colors = _many_rods.colored_tubes(model, model.state().points(), t=2.0)
     a, b, c = np.moveaxis(points[triangles], 1, 0)
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    masks = [(colors == color).all(axis=1) for color in [*_touching.colors(model), [_touching.GREY] * 3]]
+    masks = [(colors == color).all(axis=1) for color in [*_many_rods.colors(model), [_many_rods.GREY] * 3]]
     assert np.sum(masks) == len(triangles)
     perimeter = 2.0 * SIDES * 0.05 * np.sin(np.pi / SIDES)
     ring = 120.0 * np.sin(np.pi / 60)

@@ -17,7 +17,7 @@ RUBBER = ddg.Material(young=1e7, poisson=0.5, density=1000.0)
 HAIR = ddg.Material(young=4e9, poisson=0.4, density=1300.0)
 T60 = 1.0 / 60.0
 SCHEMES = ("implicit_euler", "implicit_midpoint")
-SOLVERS = ("sweep", "partitioned", "net")  # solvers of uncoupled rods, and a coupled system
+SOLVERS = ("sweep", "cyclic_reduction", "net")  # solvers of uncoupled rods, and a coupled system
 
 
 def linear_of(solver: str) -> str:

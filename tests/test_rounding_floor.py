@@ -182,7 +182,7 @@ def test_changed_solver_drops_compression(device):
         statistics = integrator.statistics()
         assert statistics["linear"] == ["float32 with tensions" if precision == "mixed" else "float64"]
         assert set(statistics["outcomes"]) <= {"converged", "converged_to_rounding"}
-        assert integrator._chains[0].newton.islands.drop_compression.numpy().tolist() == [1]
+        assert integrator._rod_steps[0].newton.islands.drop_compression.numpy().tolist() == [1]
         results[precision] = statistics["newton_iterations"]["max"], np.abs(state.points()[-1])
     assert results["mixed"][0] <= 1.5 * results["float64"][0]
     np.testing.assert_allclose(results["mixed"][1], results["float64"][1], atol=1e-6)

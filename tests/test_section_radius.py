@@ -31,11 +31,11 @@ def viscous(**section) -> ddg.Scene:
 def test_contact_requires_a_radius():
     with pytest.raises(ddg.SceneError, match=r"rod 0 \('cable'\) .* give Stiffness\(radius=...\)"):
         rod_on_a_plane().build("cpu")
-    assert rod_on_a_plane(radius={"cable": 0.02}).build("cpu").coupled.host.touching.bodies[0].radius == 0.02
+    assert rod_on_a_plane(radius={"cable": 0.02}).build("cpu").coupled.host.contact_parameters.bodies[0].radius == 0.02
     made = scene(radius=0.03)
     made.add_obstacle(ddg.Plane())
     made.contact()
-    assert made.build("cpu").coupled.host.touching.bodies[0].radius == 0.03
+    assert made.build("cpu").coupled.host.contact_parameters.bodies[0].radius == 0.03
 
 
 def test_viscous_drag_requires_a_radius():

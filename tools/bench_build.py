@@ -1,4 +1,4 @@
-"""Time what comes before the first step: scenes, models, rest shapes, states, controls and kernels.
+"""Time the work before the first step: scenes, models, rest shapes, states, controls and kernels.
 
     python tools/bench_build.py [--quick] [--only WHAT ...] [--json FILE]   seconds of this version
     python tools/bench_build.py --rows FILE --against FILE [--out DIR]      a table of them and those of another version
@@ -6,7 +6,7 @@
 `pile`: the scene `rod_pile` and its model. `sag_free`: rest strains of strands of 32 nodes. `rods`: scene and model of rods of 64
 nodes. `state`, `points`: their rest state, and its points. `controls`: a step with forces, poses and gravity of every world, less a
 step without. `cold`: `rod_pile` of six rods up to its first step, in a process with an empty kernel cache. `seconds` is process
-time, of which other work on the machine takes no part, and `wall` the time that passes. `floor` is the time of one NumPy copy of
+time, which other work on the machine does not change, and `wall` is elapsed time. `floor` is the time of one NumPy copy of
 the bytes of the result. Only the public interface is used, so that the file also runs with other versions of the package.
 """
 
@@ -100,15 +100,15 @@ def controls(worlds: int):
     forces, poses = np.zeros((worlds, 64, 3)), np.zeros((worlds, 1, 6))
     gravity = np.tile(scene.gravity, (worlds, 1))
 
-    def step(*given):
-        integrator.step(state, DT, *given)
+    def step(*controls):
+        integrator.step(state, DT, *controls)
         wp.synchronize_device(model.wp_device)
 
-    given = ddg.Controls(poses, forces, gravity=gravity)
-    step(given)
+    controls = ddg.Controls(poses, forces, gravity=gravity)
+    step(controls)
     step()
     with_controls, without = (
-        np.min([timed(lambda f=inputs: step(*f))[1:] for _ in range(5)], axis=0) for inputs in ((given,), ())
+        np.min([timed(lambda f=inputs: step(*f))[1:] for _ in range(5)], axis=0) for inputs in ((controls,), ())
     )
     yield "controls", forces.nbytes, *(with_controls - without).tolist()
     yield "a step without", 0, *without.tolist()
@@ -130,9 +130,9 @@ def measured(options) -> dict:
     """Return the rows of this version, with their command and machine."""
     sizes, rows, speed = QUICK if options.quick else SIZES, [], bandwidth()
     for name in options.only:
-        for what, size, seconds, wall in CASES[name](sizes[name]):
+        for label, size, seconds, wall in CASES[name](sizes[name]):
             floor = size / speed if size else ""
-            rows.append({"what": what, "size": sizes[name], "seconds": seconds, "wall": wall, "floor": floor})
+            rows.append({"what": label, "size": sizes[name], "seconds": seconds, "wall": wall, "floor": floor})
             print(table(rows[-1:]).splitlines()[1], file=sys.stderr, flush=True)
     command = " ".join(["python", "tools/bench_build.py", *sys.argv[1:]])
     return {"command": command, "machine": machine(), "rows": rows}
@@ -155,8 +155,8 @@ def main() -> None:
         write_json(options.json, result)
     rows = result["rows"]
     if options.against:
-        other = json.loads(options.against.read_text())
-        before = {row["what"]: row for row in other["rows"]}
+        earlier = json.loads(options.against.read_text())
+        before = {row["what"]: row for row in earlier["rows"]}
         rows = [
             {"what": row["what"], "size": row["size"]}
             | {f"{name}_before": before[row["what"]][name] for name in ("seconds", "wall")}
@@ -164,7 +164,7 @@ def main() -> None:
             for row in rows
         ]
         origin = {name: result[name] for name in ("command", "machine")}
-        write_table(options.out / "build_cpu", rows, {**origin, "before": other["machine"]["commit"]})
+        write_table(options.out / "build_cpu", rows, {**origin, "before": earlier["machine"]["commit"]})
     print(table(rows))
 
 

@@ -121,7 +121,7 @@ def run(name: str, device, limit: float) -> list[dict]:
                 "cg": (statistics["pcg_iterations"] - before["pcg_iterations"]) / number,
                 "searches": (touching["searches"] - earlier["searches"]) / number,
                 "contacts": touching["contacts"]["last"],
-                "gap": touching["smallest_gap"] / contact.search.reach,
+                "gap": touching["smallest_gap"] / contact.search.search_distance,
                 "refused": touching["refused_crossings"],
                 "gained": None
                 if driven

@@ -73,7 +73,7 @@ TIMED = ("twisted", "planar", "twisted exact", "net", "net exact")
 
 def newton_of(integrator):
     """Return the solver of the uncoupled rods, or of the coupled system."""
-    return (integrator._coupled or integrator._chains[0]).newton
+    return (integrator._coupled or integrator._rod_steps[0]).newton
 
 
 def cubin(data: bytes) -> dict:

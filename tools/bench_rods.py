@@ -181,7 +181,7 @@ def largest_residual(integrator: ddg.Integrator, state) -> float:
     last.
     """
     worst = [] if integrator._coupled is None else [np.abs(integrator._coupled.newton.system.rhs.numpy()).max()]
-    for chain in integrator._chains:
+    for chain in integrator._rod_steps:
         newton = chain.newton
         newton.islands.status.zero_()
         newton.islands.iteration.zero_()

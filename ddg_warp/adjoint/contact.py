@@ -44,19 +44,19 @@ class ContactAdjoint:
     """
 
     def __init__(self, coupled):
-        contact, real, device = coupled.host.touching, coupled.real, coupled.device
+        contact, real, device = coupled.host.contact_parameters, coupled.real, coupled.device
         self.coupled, self.system = coupled, ExactContact(coupled)
         terms, search = self.system.terms, self.system.search
         serial, nodes = device_arrays.serial(device), len(terms.forces)
         every = wp.zeros(coupled.blocks, dtype=wp.uint8, device=device)
         self.friction_iterations = contact.law.friction_iterations if terms.frictions else 1
-        self._rubs = terms.frictions or [None] * len(terms.lists)
+        self._friction_sets = terms.frictions or [None] * len(terms.lists)
         kinds = [pairs.kind for pairs in search.lists]
         self._vjp = [pull_kernel(kind, contact.density, real) for kind in kinds]
         leads = [friction.directions[0] is not None for friction in terms.frictions]
         self._rolls = [friction.rolls for friction in terms.frictions] or [False] * len(kinds)
         self._spins = terms.spins if terms.frictions and terms.spins.any else None
-        self.rubbing, spins = FrictionJacobian(coupled, self.system), bool(self._spins)
+        self.friction_jacobian, spins = FrictionJacobian(coupled, self.system), bool(self._spins)
         self._direct = contact_parameters.direction_kernels(real) if any(leads) else ()
         direction_nodes = search.shapes.beside
         self._leads = [
@@ -67,15 +67,17 @@ class ContactAdjoint:
         self._group, self._bodies = contact_parameters.group_kernels(real), contact_parameters.body_kernel(real)
         self._items, self._add = [Incidence(kind, nodes, every) for kind in kinds], sum_kernel(real, serial)
         rolling = zip(kinds, self._items, self._rolls, strict=True)
-        self._rub_items = [Incidence(kind, nodes, every, True) if rolls else items for kind, items, rolls in rolling]
+        self._friction_items = [
+            Incidence(kind, nodes, every, True) if rolls else items for kind, items, rolls in rolling
+        ]
         self.by_groups = self._zeros(NUMBERS, *terms.law.stiffness.shape)
-        self.by_radius = self._zeros(*coupled.touching["radius"].shape)
-        self._things, self._starts, self._spun_things = {}, {}, {}
+        self.by_radius = self._zeros(*coupled.contact_parameters["radius"].shape)
+        self._primitives, self._starts, self._rotating_primitives = {}, {}, {}
         self._by_spun = self._zeros(SPUN, *self.by_radius.shape)
         for size in search.shapes.sizes:
-            owner = search.shapes.things(size)[2]
-            self._things[size] = self._zeros(coupled.worlds * len(owner))
-            self._spun_things[size] = self._zeros(SPUN if spins else 0, coupled.worlds * len(owner))
+            owner = search.shapes.primitives(size)[2]
+            self._primitives[size] = self._zeros(coupled.worlds * len(owner))
+            self._rotating_primitives[size] = self._zeros(SPUN if spins else 0, coupled.worlds * len(owner))
             starts = np.searchsorted(owner, np.arange(len(contact.bodies) + 1)).astype(np.int32)
             self._starts[size] = wp.array(starts, dtype=int, device=device)
         most = max(self._pieces(pairs)[0] for pairs in search.lists)
@@ -85,11 +87,11 @@ class ContactAdjoint:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        first = [*self._vjp, *self.rubbing.kernels, self._add, *self._group, self._bodies, *self._direct]
+        first = [*self._vjp, *self.friction_jacobian.kernels, self._add, *self._group, self._bodies, *self._direct]
         return [
             *first,
             *(k for pair in self._sides for k in pair),
-            *(k for items in {*self._items, *self._rub_items} for k in items.kernels),
+            *(k for items in {*self._items, *self._friction_items} for k in items.kernels),
         ]
 
     @property
@@ -108,8 +110,8 @@ class ContactAdjoint:
         """Allocate memory for the capacity of the candidate lists."""
         lists = self.system.search.lists
         self._numbers = self._zeros(NUMBERS, max(pairs.capacity for pairs in lists))
-        self.rubbing.reserve()
-        for items, pairs in {*zip(self._items, lists, strict=True), *zip(self._rub_items, lists, strict=True)}:
+        self.friction_jacobian.reserve()
+        for items, pairs in {*zip(self._items, lists, strict=True), *zip(self._friction_items, lists, strict=True)}:
             items.reserve(pairs.capacity)
 
     def vjp(self, positions: tuple, w: wp.array, rate: wp.array, gradients: tuple) -> None:
@@ -122,29 +124,39 @@ class ContactAdjoint:
             gradients: gradients by these `positions`, added to.
         """
         terms, (_, before, q), (by_lagged, by_before, grad_q) = self.system.terms, positions, gradients
-        for array in (*self._things.values(), *self._spun_things.values()):
+        for array in (*self._primitives.values(), *self._rotating_primitives.values()):
             array.zero_()
-        for i, (part, rub) in enumerate(zip(terms.lists, self._rubs, strict=True)):
+        for i, (part, friction_set) in enumerate(zip(terms.lists, self._friction_sets, strict=True)):
             read, pairs = [part.pairs, part.count, part.found.sides, terms.law], part.found.capacity
             self._items[i].list(part.count, part.factor)
             inputs = [*read, part.factor.nodes, q, w]
             self._take_turns(self._vjp[i], pairs, inputs, [part.gradient, self._numbers])
             self._add_up(self._items[i], part, part.gradient, grad_q)
             self._sum(i, self._items[i], part)
-            if rub:
-                items = self._rub_items[i]
-                items.list(rub.count, rub.factor)
-                written = self.rubbing.vjp(i, (rub.factor.nodes, rub.factor.angles), positions, w, rate, self._numbers)
+            if friction_set:
+                items = self._friction_items[i]
+                items.list(friction_set.count, friction_set.factor)
+                written = self.friction_jacobian.vjp(
+                    i, (friction_set.factor.nodes, friction_set.factor.angles), positions, w, rate, self._numbers
+                )
                 for values, gradient in zip(written, (grad_q, by_before, by_lagged), strict=True):
-                    self._add_up(items, rub, values, gradient)
-                self._sum(i, items, rub)
-                self._lead(i, rub, by_lagged)
-                if rub.rolls:
-                    self._to_things(i, items, rub, (self.rubbing.radii[0], self.rubbing.radii[1]), self._things)
+                    self._add_up(items, friction_set, values, gradient)
+                self._sum(i, items, friction_set)
+                self._lead(i, friction_set, by_lagged)
+                if friction_set.rolls:
+                    self._to_primitives(
+                        i,
+                        items,
+                        friction_set,
+                        (self.friction_jacobian.radii[0], self.friction_jacobian.radii[1]),
+                        self._primitives,
+                    )
                 if self._spins:
                     for row in range(SPUN):
-                        self._to_things(i, items, rub, (self.rubbing.spun[row],) * 2, self._spun_row(row))
-        self._to_bodies(self._things, self.by_radius)
+                        self._to_primitives(
+                            i, items, friction_set, (self.friction_jacobian.spun[row],) * 2, self._spun_row(row)
+                        )
+        self._to_bodies(self._primitives, self.by_radius)
         if self._spins:
             self._by_spun.zero_()
             for row in range(SPUN):
@@ -153,7 +165,7 @@ class ContactAdjoint:
 
     def matrix(self, q: wp.array, before: wp.array, rate: wp.array):
         """Return the friction matrix as `FrictionJacobian`; a following `vjp` has room for all pairs."""
-        version, matrix = self.system.search.version, self.rubbing.matrix(q, before, rate)
+        version, matrix = self.system.search.version, self.friction_jacobian.matrix(q, before, rate)
         if self.system.search.version != version:
             self._reserve()
         return matrix
@@ -184,9 +196,9 @@ class ContactAdjoint:
         inputs = [*lists, part.pairs, pairs.sides, law, self._numbers, number, size]
         self._launch(pieces, self.coupled.worlds * number, inputs, [self._partial])
         self._launch(total, self.by_groups.shape[1:], [self._partial, number], [self.by_groups])
-        self._to_things(index, items, part, (self._numbers[THICKNESS],) * 2, self._things)
+        self._to_primitives(index, items, part, (self._numbers[THICKNESS],) * 2, self._primitives)
 
-    def _to_things(self, index: int, items: Incidence, part, values: tuple, out: dict[int, wp.array]) -> None:
+    def _to_primitives(self, index: int, items: Incidence, part, values: tuple, out: dict[int, wp.array]) -> None:
         """Sum values of pairs, of both sides (capacity,), by primitive, for each primitive size."""
         pairs, (first, second), (first_values, second_values) = part.found, self._sides[index], values
         inputs = [part.count, part.starts, part.partners, first_values]
@@ -202,7 +214,7 @@ class ContactAdjoint:
 
     def _spun_row(self, row: int) -> dict[int, wp.array]:
         """Return a row of the gradient by spins, by primitive size."""
-        return {size: values[row] for size, values in self._spun_things.items()}
+        return {size: values[row] for size, values in self._rotating_primitives.items()}
 
     def _led(self, ends: np.ndarray) -> tuple:
         """Return for every node the first primitives with an end there (offsets, items), and scratch of the gradient by directions."""
@@ -211,14 +223,17 @@ class ContactAdjoint:
         upload = (device_arrays.upload(np.asarray(v, np.int32), int, self.coupled.device) for v in (starts, items))
         return *upload, by_direction
 
-    def _lead(self, index: int, rub, by_lagged: wp.array) -> None:
+    def _lead(self, index: int, friction_set, by_lagged: wp.array) -> None:
         """Add the terms of rod directions to the gradient by lagged positions."""
         if self._leads[index]:
             per_primitive, gather = self._direct
             starts, items, by_direction = self._leads[index]
             flat, nodes = by_direction.flatten(), by_lagged.reshape((self.coupled.worlds, self.coupled.blocks))
             self._launch(
-                per_primitive, len(flat), [rub.count, rub.starts, rub.partners, self.rubbing.by_direction], [flat]
+                per_primitive,
+                len(flat),
+                [friction_set.count, friction_set.starts, friction_set.partners, self.friction_jacobian.by_direction],
+                [flat],
             )
             self._launch(gather, nodes.shape, [starts, items, by_direction], [nodes])
 

@@ -57,7 +57,7 @@ class CoupledLinearSolve:
         return [*self.system.kernels, self._chain] if self.system else []
 
     def __call__(
-        self, state, rate: float, time: float, rhs: wp.array, w: wp.array, factors: bool = False, rubbing=None
+        self, state, rate: float, time: float, rhs: wp.array, w: wp.array, factors: bool = False, friction_jacobian=None
     ) -> None:
         """Write w (W N,), zero at fixed dofs.
 
@@ -66,7 +66,8 @@ class CoupledLinearSolve:
             rate: inverse step of implicit Euler [1/s], zero for an equilibrium with the load parameter `time`.
             rhs: g (W N,).
             factors: True to solve on the host, after conjugate gradients have failed.
-            rubbing: friction term of H in an equilibrium (3 W N, 3 W N), see `ContactAdjoint.rubbing`; None without.
+            friction_jacobian: friction term of H in an equilibrium (3 W N, 3 W N), see `ContactAdjoint.friction_jacobian`; None
+                without.
 
         Raises:
             SolverError: H is singular (host only; see `failed`), or the host is to solve a step in contact, which it cannot.
@@ -84,13 +85,15 @@ class CoupledLinearSolve:
         tangent, host = self.tangent, self._host
         more = self.drag.matrix if self.drag else None
         rhs = tangent.into(rhs.numpy().astype(float).ravel())
-        solution = host(SimpleNamespace(coupled=state), rate, coefficient, None if rate else time, rhs, more, rubbing)
+        solution = host(
+            SimpleNamespace(coupled=state), rate, coefficient, None if rate else time, rhs, more, friction_jacobian
+        )
         w.assign(tangent.back(solution).reshape(-1, 3))
         if host.held is not None:
             self.held = wp.empty_like(w)
             self.held.assign(tangent.back(host.held).reshape(-1, 3))
 
-    def chain(self, by_lagged: wp.array, grad_q: wp.array) -> None:
+    def vjp_by_lagged(self, by_lagged: wp.array, grad_q: wp.array) -> None:
         """Overwrite free entries of `grad_q` (W N,) with the gradient `by_lagged`, and add `by_lagged` to its fixed entries.
 
         The result is the right-hand side g of the friction iteration before; `by_lagged` is zeroed.

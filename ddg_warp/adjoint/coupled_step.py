@@ -27,8 +27,8 @@ class CoupledSavedStep:
     """Data of a step for the reverse pass: the state `before`, and the solution of its solve with time-lagged data.
 
     `lagged` are the solutions at the friction lags (W N,), in this order; all other lagged data stay. For an equilibrium with
-    friction, `before` is the state that slips are measured from, and `rubbing` is the inverse increment of the load parameter since
-    then.
+    friction, `before` is the state that slips are measured from, and `friction_rate` is the inverse increment of the load parameter
+    since then.
     """
 
     before: CoupledState
@@ -37,7 +37,7 @@ class CoupledSavedStep:
     retries: wp.array | None = None
     time: float = 0.0
     lagged: list[wp.array] = field(default_factory=list)
-    rubbing: float = 0.0
+    friction_rate: float = 0.0
 
     @property
     def frame(self) -> wp.array:
@@ -58,7 +58,7 @@ class CoupledInputs:
         drag: by drag coefficients (rows, W edges with drag); None without drag.
         rate, damping, gravity: by the quantities common to all blocks, one entry per block (W N,).
         elements_rate: by the rate, of every set (W E,), and of friction.
-        touching, radius: by the parameters of contact, see `ContactAdjoint`; None without contact.
+        contact_parameters, radius: by the parameters of contact, see `ContactAdjoint`; None without contact.
     """
 
     parameters: list[wp.array]
@@ -72,7 +72,7 @@ class CoupledInputs:
     gravity: wp.array
     drag: wp.array | None
     elements_rate: list[wp.array]
-    touching: wp.array | None = None
+    contact_parameters: wp.array | None = None
     radius: wp.array | None = None
 
 
@@ -99,7 +99,7 @@ class CoupledStepAdjoint:
         self.predictor = CoupledPredictor.of(model, coupled, motion, scheme)
         self._shares = CoupledAssembly(model)
         self.drag = CoupledDragAdjoint(model, coupled, midpoint, self._shares.gather) if drag else None
-        self.contact = ContactAdjoint(coupled) if host.touching else None
+        self.contact = ContactAdjoint(coupled) if host.contact_parameters else None
         self.solve = CoupledLinearSolve(model, self.drag, self.contact and self.contact.system, scheme is not None)
         self.gravity = wp.array(
             np.tile(model.scene.gravity, (coupled.worlds, 1)), dtype=coupled.vector, device=self.device
@@ -115,7 +115,7 @@ class CoupledStepAdjoint:
         self._ended = coupled_step.end_kernel(real)
         self._resisted = self.drag.inertia.transpose((1, 0)) if drag else None
         self._leaves = coupled.common(wp.zeros(coupled.blocks, dtype=wp.uint8, device=self.device))
-        self._rates, self._rubbing = (wp.zeros(coupled.worlds, dtype=real, device=self.device) for _ in range(2))
+        self._rates, self._friction_rate = (wp.zeros(coupled.worlds, dtype=real, device=self.device) for _ in range(2))
 
         def make(dtype=coupled.vector):
             return wp.zeros(count, dtype=dtype, device=self.device)
@@ -146,7 +146,7 @@ class CoupledStepAdjoint:
             ],
         )
         if self.contact:
-            self._inputs.touching, self._inputs.radius = self.contact.by_groups, self.contact.by_radius
+            self._inputs.contact_parameters, self._inputs.radius = self.contact.by_groups, self.contact.by_radius
             self._inputs.elements_rate.append(self.contact.grad_inverse_step)
 
     @property
@@ -239,16 +239,16 @@ class CoupledStepAdjoint:
         masses = [coupled.mass.transpose((1, 0)), None]
         read = [end, more, None, *masses, self._resisted, coupled.count, last, self._rates]
         self._launch(self._solution, grid, read, [components(grad_q), None])
-        self._rubbing.fill_(kept.rubbing or rate)
+        self._friction_rate.fill_(kept.friction_rate or rate)
         rough, lag_pairs = None, reversed(list(pairwise([before.q, *kept.lagged, solved.q])))
-        if kept.rubbing:  # normal forces of the equilibrium
-            rough, lag_pairs = self.contact.matrix(solved.q, before.q, self._rubbing), [(solved.q, solved.q)]
+        if kept.friction_rate:  # normal forces of the equilibrium
+            rough, lag_pairs = self.contact.matrix(solved.q, before.q, self._friction_rate), [(solved.q, solved.q)]
         by_tangents = by_predicted if self._midpoint else start.q
         for lag_q, q in lag_pairs:  # lag positions of friction, and the solution
             damped = replace(solved, q=q, last=before.last)
             if self.contact:
                 rates = after.rate, before.rate if lag_q is before.q else None
-                self.contact.system.find(lag_q, before.q, q, self._rubbing, rates)
+                self.contact.system.find(lag_q, before.q, q, self._friction_rate, rates)
             self.solve(damped, rate, kept.time, grad_q, w, factors, rough)
             shares.clear()
             for i, kernel in enumerate(self._vjp):
@@ -269,11 +269,11 @@ class CoupledStepAdjoint:
                     for source, gradient in ((before.q, start.q), (q, grad_q), (lag_q, self._by_lagged))
                     if source is lag_q
                 )
-                self.contact.vjp((lag_q, before.q, q), w, self._rubbing, (by_lagged, start.q, grad_q))
-                if kept.rubbing:
+                self.contact.vjp((lag_q, before.q, q), w, self._friction_rate, (by_lagged, start.q, grad_q))
+                if kept.friction_rate:
                     self.contact.roll(q, before.q, start.q, grad_q)
             if lag_q is not before.q and lag_q is not q:
-                self.solve.chain(self._by_lagged, grad_q)
+                self.solve.vjp_by_lagged(self._by_lagged, grad_q)
         if self.solve.held is not None:
             wp.map(wp.add, grad_q, self.solve.held, out=grad_q)
         if self.supports:

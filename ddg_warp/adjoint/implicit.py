@@ -57,7 +57,7 @@ class Adjoint:
         self.integrator, self.model = integrator, integrator.model
         refuse_gyroscopic("Adjoint", integrator.gyroscopic)
         integrator.step_whole()
-        self.chains = [RodStepAdjoint(self.model, group, integrator.scheme) for group in self.model.groups]
+        self.rod_adjoints = [RodStepAdjoint(self.model, group, integrator.scheme) for group in self.model.groups]
         self.coupled = CoupledStepAdjoint(self.model, integrator.scheme) if self.model.coupled is not None else None
         self._grips = (
             self.model.empty_state().grips
@@ -66,7 +66,7 @@ class Adjoint:
     @property
     def parts(self) -> list:
         """Adjoints of the rod groups and of the coupled system, in the order of the integrator's steppers."""
-        return [*self.chains, *([self.coupled] if self.coupled else [])]
+        return [*self.rod_adjoints, *([self.coupled] if self.coupled else [])]
 
     def step(self, state: State, dt: float) -> tuple[State, Tape]:
         """Return the state after a step, and the tape of its backward pass, which stays valid while referenced.
@@ -83,7 +83,7 @@ class Adjoint:
         integrator = self.integrator
         kept = [
             adjoint.keep(part, state.groups[part.index])
-            for adjoint, part in zip(self.chains, integrator._chains, strict=True)
+            for adjoint, part in zip(self.rod_adjoints, integrator._rod_steps, strict=True)
         ]
         return kept + ([self.coupled.keep(integrator._coupled, state.coupled)] if self.coupled else [])
 
@@ -110,7 +110,7 @@ class Adjoint:
         if self.coupled and self.coupled.solve.failed is not None and self.coupled.solve.failed.numpy().any():
             gradients = self.vjp_of_parts(*arguments, factors=True)
         gradients = _copied(*gradients)
-        for adjoint, part in zip(self.chains, self.integrator._chains, strict=True):
+        for adjoint, part in zip(self.rod_adjoints, self.integrator._rod_steps, strict=True):
             _require_minimum(adjoint, part)
         return gradients
 
@@ -138,7 +138,7 @@ class Adjoint:
         With `factors` the coupled system is solved by sparse factors on the host, for steps where conjugate gradients failed.
         """
         groups, inputs = [], []
-        for adjoint, kept, end, by_end in zip(self.chains, parts, after.groups, cotangent.groups, strict=False):
+        for adjoint, kept, end, by_end in zip(self.rod_adjoints, parts, after.groups, cotangent.groups, strict=False):
             start, read = adjoint.vjp(kept, end, by_end, s, (before, after))
             groups.append(start)
             inputs.append(read)
@@ -179,14 +179,14 @@ class EquilibriumAdjoint:
 
     def __init__(self, model, posed: bool = False):
         self.model = model
-        self.chains = [RodStepAdjoint(model, group, None, posed) for group in model.groups]
+        self.rod_adjoints = [RodStepAdjoint(model, group, None, posed) for group in model.groups]
         self.coupled = CoupledStepAdjoint(model, None, posed) if model.coupled is not None else None
         self.by_before = None
 
     @property
     def parts(self) -> list:
         """Adjoints of the rod groups and of the coupled system."""
-        return [*self.chains, *([self.coupled] if self.coupled else [])]
+        return [*self.rod_adjoints, *([self.coupled] if self.coupled else [])]
 
     def vjp(self, state: State, cotangent: State, controls: Controls | None = None) -> list:
         """Return the gradient with respect to the inputs of the residual: `RodInputs` of every rod group, `CoupledInputs`.
@@ -209,7 +209,7 @@ class EquilibriumAdjoint:
             gravity = np.broadcast_to(control_values.get("gravity", self.model.scene.gravity), (self.model.worlds, 3))
             adjoint.gravity.assign(np.ascontiguousarray(gravity[:, list(adjoint.axes)], float))
             adjoint.upload(state.time, state.time)
-        for adjoint, group_state, by_group in zip(self.chains, state.groups, cotangent.groups, strict=True):
+        for adjoint, group_state, by_group in zip(self.rod_adjoints, state.groups, cotangent.groups, strict=True):
             kept = SavedStep(group_state, group_state.x, group_state.theta, group_state.frame, None, time=state.time)
             inputs += _copied(
                 self.model.empty_state(), [adjoint.vjp(kept, group_state, by_group, np.inf, (state, state))[1]]
@@ -217,7 +217,7 @@ class EquilibriumAdjoint:
         if self.coupled:
             kept = CoupledSavedStep(state.coupled, state.coupled, None, time=state.time)
             if self.has_friction:
-                kept = replace(kept, before=self._before(state), rubbing=1.0 / state.sliding.increment)
+                kept = replace(kept, before=self._before(state), friction_rate=1.0 / state.sliding.increment)
             asked = kept, state.coupled, cotangent.coupled, np.inf, (state, state)
             start, read = self.coupled.vjp(*asked)
             while self.coupled.has_overflow(state.coupled.q):
@@ -236,8 +236,8 @@ class EquilibriumAdjoint:
         """True if equilibria have friction."""
         return (
             self.coupled is not None
-            and self.coupled.coupled.host.touching is not None
-            and self.coupled.coupled.host.touching.has_friction
+            and self.coupled.coupled.host.contact_parameters is not None
+            and self.coupled.coupled.host.contact_parameters.has_friction
         )
 
     def _before(self, state: State) -> CoupledState:

@@ -35,7 +35,14 @@ class HostSolve:
         self.held = None
 
     def __call__(
-        self, state, rate: float, coefficient: float, factor: float | None, rhs: np.ndarray, more=None, rubbing=None
+        self,
+        state,
+        rate: float,
+        coefficient: float,
+        factor: float | None,
+        rhs: np.ndarray,
+        more=None,
+        friction_jacobian=None,
     ) -> np.ndarray:
         """Return w (size,), zero at fixed dofs.
 
@@ -46,7 +53,7 @@ class HostSolve:
             factor: load parameter of an equilibrium, which has load stiffness dL/dq; None in a step, where loads are lagged.
             rhs: g (size,).
             more: additional matrix, of drag; None without.
-            rubbing: additional matrix, unsymmetric, of friction in an equilibrium; None without.
+            friction_jacobian: additional matrix, unsymmetric, of friction in an equilibrium; None without.
 
         A singular matrix, with zero stiffness along a motion, is accepted if g has no component along the motion.
 
@@ -56,7 +63,9 @@ class HostSolve:
         tangent, following = self.tangent, None
         tangent.rate = wp.full(len(tangent.rate), rate, dtype=tangent.rate.dtype, device=tangent.rate.device)
         hessian = (
-            tangent.hessian(state) if rubbing is None else tangent.potential_hessian(state) + tangent.matrix(rubbing)
+            tangent.hessian(state)
+            if friction_jacobian is None
+            else tangent.potential_hessian(state) + tangent.matrix(friction_jacobian)
         )
         if coefficient == 0.0 and tangent.model.touch is None:
             self._require_stiff(state, hessian)
@@ -64,7 +73,7 @@ class HostSolve:
         if more is not None:
             matrix = matrix + tangent.matrix(more)
         if factor is not None:
-            spun = self._spun(state, factor, rubbing is not None)
+            spun = self._spun(state, factor, friction_jacobian is not None)
             following = _total(tangent.load_stiffness(factor, tangent.dofs(state)), spun)
         free = np.flatnonzero(tangent.free)
         free_matrix, rhs = (
@@ -72,7 +81,7 @@ class HostSolve:
             rhs[free],
         )
         try:
-            symmetric = following is None and rubbing is None
+            symmetric = following is None and friction_jacobian is None
             solve = regular(free_matrix, tangent.mass[free])[0].solve if symmetric else _transposed(free_matrix)
             solution = solve(rhs)
         except (SingularError, RuntimeError) as error:
@@ -103,16 +112,16 @@ class HostSolve:
                 outcome="neutral",
             )
 
-    def _spun(self, state, factor: float, rubs: bool) -> sparse.csc_matrix | None:
+    def _spun(self, state, factor: float, has_friction: bool) -> sparse.csc_matrix | None:
         """Return the stiffness from transport of frames, which the tangent keeps fixed; None if no moment acts on an edge.
 
         A moment M on the twist angle of an edge e rotates with its frame. The transported frame spins about the tangent t by
         t . (t x de) / 2 |e| less than a fixed one. This adds the force M [t] de / 2 |e|^2 across the edge, with [t] the matrix of t
-        x. M is the sum of loads, reactions and, if `rubs`, friction; together they balance the elastic moment.
+        x. M is the sum of loads, reactions and, if `has_friction`, friction; together they balance the elastic moment.
         """
         tangent, rows, columns, values = self.tangent, [], [], []
         q = tangent.dofs(state)
-        moments = np.where(tangent.free & (not rubs), tangent.loads(factor, q), tangent.gradient(state))
+        moments = np.where(tangent.free & (not has_friction), tangent.loads(factor, q), tangent.gradient(state))
         for body in tangent.bodies():
             if len(body.angles) and (body.nodes >= 0).all():
                 ends = body.nodes[body.ends]  # (edges, 2, 3)
@@ -170,7 +179,7 @@ class DirectSolve:
         kind, device, real = group.kind, model.wp_device, model.types.real
         arguments, size = (model, group, NewtonOptions(psd="none"), real), (group.nodes, group.columns)
         self._wanted = wp.full(group.columns, 1, dtype=int, device=device)
-        few = automatic(group) == "partitioned"
+        few = automatic(group) == "cyclic_reduction"
         if not few and not kind.closed and linear is None:
             self.solver, self.system = None, RodNewton(*arguments)
             self._moved = self.system.x, self.system.theta  # arrays that the sweep moves along w

@@ -52,7 +52,7 @@ class ContactParameters:
 
     law: Contact
     density: Density
-    keep: float
+    min_separation_fraction: float
     bodies: list[Body]
     names: list[str]
     group: np.ndarray
@@ -85,7 +85,7 @@ class ContactParameters:
         return bool(self.friction.any())
 
     @property
-    def reach(self) -> float:
+    def search_distance(self) -> float:
         """Largest activation distance [m]."""
         return float(self.range.max())
 

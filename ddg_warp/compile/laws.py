@@ -122,7 +122,7 @@ def contact_law(contact, stiffness: np.ndarray, ranges: np.ndarray, explicit: bo
             raise SceneError(f"{where}: {name} does not fit; it takes {', '.join(names)}")
     if explicit and "stiffness" not in names:
         raise SceneError(f"{where} takes no stiffness; leave it out, or give the law a parameter of this name")
-    keep = 0.0
+    min_separation_fraction = 0.0
     for activation in {float(ranges.min()), float(ranges.max())}:
         values = {**law.values, "stiffness": float(stiffness.max()), "range": activation}
         constants = tuple(_constant(where, parameter, values) for parameter in parameters)
@@ -146,9 +146,9 @@ def contact_law(contact, stiffness: np.ndarray, ranges: np.ndarray, explicit: bo
                     f"{where} has the {quantity} {abs(samples[5]):.3g} at the range, {activation:.3g} m, beyond which contact does "
                     "not act; let both end there, or give contact(range=...)"
                 )
-        keep = max(keep, float(np.isposinf(energy[6])))
+        min_separation_fraction = max(min_separation_fraction, float(np.isposinf(energy[6])))
     fixed = (0.0 if name in ("stiffness", "range") else value for name, value in zip(names, constants, strict=True))
-    return gap_law(density, tuple(fixed)), keep
+    return gap_law(density, tuple(fixed)), min_separation_fraction
 
 
 def _constant(where: str, parameter, values: dict) -> float:

@@ -174,14 +174,16 @@ def _magnetic_forces(host, part) -> np.ndarray:
     return moment * (field.sum(0) / length + gradient.sum(0))
 
 
-def largest_excess(levels: list[Level], loads: np.ndarray, rtol: float, residual: np.ndarray, floor: np.ndarray):
+def largest_excess(
+    levels: list[Level], loads: np.ndarray, rtol: float, residual: np.ndarray, rounding_floor: np.ndarray
+):
     """Return (True if all cluster sums of residuals (N, 3) are small, largest excess over limit and rounding).
 
     Args:
         loads: load scales of the bodies (count,) [N].
-        floor: rounding floor of each dof block (N,), summed like independent random numbers.
+        rounding_floor: rounding floor of each dof block (N,), summed like independent random numbers.
     """
-    small, excess, square = True, -np.inf, floor**2
+    small, excess, square = True, -np.inf, rounding_floor**2
     for level in levels:
         residual, square = (np.add.reduceat(v[level.items], level.starts[:-1], axis=0) for v in (residual, square))
         size, limit = np.abs(residual).max(1), rtol * loads[level.body] * level.weight

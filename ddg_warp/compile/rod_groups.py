@@ -149,14 +149,14 @@ def compile_rod_groups(scene: Scene, chosen: np.ndarray | None = None) -> list[R
             last.append(part)
         else:
             groups.append([part])
-    chains = [_join(group, ghosts, laws) for group in groups]
-    for chain in chains:
-        claims = boundary_conditions.ConstraintRegistry(scene, chain)
-        boundary_conditions.fix_rods(scene, chain, claims)
+    rod_groups = [_join(group, ghosts, laws) for group in groups]
+    for rod_group in rod_groups:
+        claims = boundary_conditions.ConstraintRegistry(scene, rod_group)
+        boundary_conditions.fix_rods(scene, rod_group, claims)
         claims.finish()
-        boundary_conditions.add_masses(scene, chain)
-        boundary_conditions.load_rods(scene, chain)
-    return chains
+        boundary_conditions.add_masses(scene, rod_group)
+        boundary_conditions.load_rods(scene, rod_group)
+    return rod_groups
 
 
 def _join(parts: list[UniformRods], ghosts: GhostNodes, laws: drag.Laws) -> RodGroupData:

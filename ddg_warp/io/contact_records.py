@@ -38,7 +38,7 @@ class Contacts:
 
 
 @dataclass(frozen=True)
-class Touching:
+class ContactScales:
     """Names and typical scales of contact, for recordings; `Model.contact_parameters`.
 
     Attributes:

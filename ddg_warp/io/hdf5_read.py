@@ -14,7 +14,7 @@ import numpy as np
 
 from ddg_warp import argument_checks
 from ddg_warp.io.contact_records import FIELDS as PAIR_FIELDS
-from ddg_warp.io.contact_records import Contacts, Touching
+from ddg_warp.io.contact_records import Contacts, ContactScales
 from ddg_warp.io.curves import CurveSet, checked_curves
 from ddg_warp.io.journal import TrajectoryError, open_to_read
 from ddg_warp.io.obstacles import Obstacles
@@ -229,7 +229,7 @@ class TrajectoryReader:
         obstacles: Obstacles as surfaces, or None.
         obstacle_points: Nodes of moving obstacles [m], shape (F, M, 3) or (F, B, M, 3), read when indexed, or None.
         contacts: `Contacts` of each frame, read when indexed by a number, or None if not recorded.
-        touching: Names and typical scales of contact, or None.
+        contact_scales: Names and typical scales of contact, or None.
         parameters: The model's parameters by name.
         attributes: Values of each rod by name, from a groom.
         provenance: The attributes of the file.
@@ -272,12 +272,12 @@ class TrajectoryReader:
             self.obstacles = Obstacles(
                 **{field.name: _array(model["obstacles"][field.name]) for field in fields_of(Obstacles)}
             )
-        self.touching = self.contacts = None
+        self.contact_scales = self.contacts = None
         if "touching" in model:
             names, size, force = (_array(model["touching"][name]) for name in ("names", "size", "force"))
-            self.touching = Touching(names.tolist(), float(size), float(force))
+            self.contact_scales = ContactScales(names.tolist(), float(size), float(force))
         if "contacts" in trajectory:
-            self.contacts = ContactFrames(trajectory["contacts"], self.touching.names, self.path)
+            self.contacts = ContactFrames(trajectory["contacts"], self.contact_scales.names, self.path)
         _refuse_misfits(self.curves, self.surfaces, self.points.shape[-2])
         self.parameters = all_arrays(model["parameters"])
         self.attributes = all_arrays(model["attributes"]) if "attributes" in model else {}

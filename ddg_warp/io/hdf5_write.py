@@ -32,8 +32,8 @@ def write_model(group: h5py.Group, model) -> None:
     if model.obstacles is not None:
         for each in fields(model.obstacles):
             overwrite(group.require_group("obstacles"), each.name, np.asarray(getattr(model.obstacles, each.name)))
-    if model.touching is not None:
-        for name, values in vars(model.touching).items():
+    if model.contact_scales is not None:
+        for name, values in vars(model.contact_scales).items():
             overwrite(group.require_group("touching"), name, np.asarray(values))
     for name, value in model.parameters().items():
         overwrite(parameters, name, np.asarray(value))

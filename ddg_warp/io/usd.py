@@ -21,7 +21,7 @@ from pxr import Tf, Usd, UsdGeom, Vt
 
 from ddg_warp import argument_checks
 from ddg_warp.io.colors import PALETTE
-from ddg_warp.io.contact_records import Contacts, Touching
+from ddg_warp.io.contact_records import Contacts, ContactScales
 from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.io.paths import CurveError
 from ddg_warp.io.shapes import Curves, Shapes
@@ -51,7 +51,7 @@ class CurvesWriter:
         attributes: Values of each rod of a world by name, shape (R,): numbers or texts, such as ids and groups of a groom.
         block: Frames between two saves, at least; a killed process leaves the frames saved last.
         obstacles: Obstacles, such as `model.obstacles`; moving obstacles are written once a world.
-        touching: Names and typical scales of contact, for frames with contacts.
+        contact_scales: Names and typical scales of contact, for frames with contacts.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class CurvesWriter:
         block: int = 32,
         attributes: Mapping[str, np.ndarray] | None = None,
         obstacles: Obstacles | None = None,
-        touching: Touching | None = None,
+        contact_scales: ContactScales | None = None,
     ):
         argument_checks.positive("CurvesWriter: fps", fps, "1/s")
         self.path = Path(path)
@@ -96,8 +96,8 @@ class CurvesWriter:
             for world in range(shapes.worlds if obstacles.moved[k] else 1):
                 path = _free_path(self._stage, str(obstacles.names[k]))
                 self._prims.append(ObstaclePrim(self._stage, path, obstacles, k, world))
-        if touching is not None:
-            self._prims.append(ContactsPrim(self._stage, _free_path(self._stage, "contacts"), touching))
+        if contact_scales is not None:
+            self._prims.append(ContactsPrim(self._stage, _free_path(self._stage, "contacts"), contact_scales))
         self._unsaved = _size_of_defaults(self._stage)
 
     def __enter__(self) -> CurvesWriter:

@@ -7,7 +7,7 @@ from pxr import Sdf, Usd, UsdGeom
 
 from ddg_warp.geometry.operators import vertex_normals
 from ddg_warp.io.colors import CONTACT, OBSTACLE
-from ddg_warp.io.contact_records import Touching
+from ddg_warp.io.contact_records import ContactScales
 from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.io.usd_prims import Frame, PointsPrim, define_mesh, floats, vectors
 
@@ -51,11 +51,11 @@ class ContactsPrim(PointsPrim):
     Args:
         stage: Stage of the new prim.
         path: Path of the new prim.
-        touching: Names and typical scales of contact.
+        contact_scales: Names and typical scales of contact.
     """
 
-    def __init__(self, stage: Usd.Stage, path: str, touching: Touching):
-        self._touching = touching
+    def __init__(self, stage: Usd.Stage, path: str, contact_scales: ContactScales):
+        self._contact_scales = contact_scales
         prim = UsdGeom.Points.Define(stage, path)
         super().__init__(prim, np.zeros(0, int), np.array(CONTACT), None)
         prim.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
@@ -66,7 +66,7 @@ class ContactsPrim(PointsPrim):
 
     def write(self, code: Usd.TimeCode, frame: Frame) -> None:
         contacts = frame.contacts
-        points, widths = vectors(contacts.point), floats(self._touching.widths(contacts.force))
+        points, widths = vectors(contacts.point), floats(self._contact_scales.widths(contacts.force))
         prim = UsdGeom.Points(self._prim)
         extent = UsdGeom.Points.ComputeExtent(points, widths) if len(contacts) else vectors(np.zeros((2, 3)))
         force, friction, gap = self._values

@@ -123,7 +123,8 @@ class CoupledModel:
         has_custom_mass: True if `mass` may differ from `host`.
         moves: masses of dof blocks (N,), positive where inertia or drag determine a rate.
         drag: drag coefficients of edges, world by world (rows, W E), see `kernels.forces.drag`; None without.
-        touching: contact parameters by name: "stiffness", "range" and "friction" (worlds, groups, groups), "radius" (worlds, bodies).
+        contact_parameters: contact parameters by name: "stiffness", "range" and "friction" (worlds, groups, groups), "radius"
+            (worlds, bodies).
     """
 
     def __init__(self, host: CoupledSystem, worlds: int, device, real, motions: np.ndarray):
@@ -142,11 +143,11 @@ class CoupledModel:
             self.drag = wp.array(np.tile(coefficients, (1, worlds)), dtype=real, device=device)
             drag_mass[ends] = 1.0
             drag_mass[angles[angles >= 0], 0] = 1.0
-        self.touching = {}
-        if host.touching:
-            for name, values in host.touching.numbers.items():
+        self.contact_parameters = {}
+        if host.contact_parameters:
+            for name, values in host.contact_parameters.numbers.items():
                 tiled = np.tile(values, (worlds, *[1] * values.ndim))
-                self.touching[name] = wp.array(tiled, dtype=real, device=device)
+                self.contact_parameters[name] = wp.array(tiled, dtype=real, device=device)
         self.moves = wp.array(host.mass + drag_mass, dtype=self.vector, device=device)
         self.ends = wp.array(np.ascontiguousarray(host.ends, np.int32).reshape(-1, 2), dtype=int, device=device)
         serial = arrays.serial(device)
@@ -178,7 +179,7 @@ class CoupledModel:
             strains = len(part.term.measure.strains) if part.term.density.lagged else 0
             state.last.append(self._zeros(strains, count if strains else 1))
         state.data = self.turning_data() | self.field_data()
-        heavy = self.host.touching and self.host.touching.inertia.any()
+        heavy = self.host.contact_parameters and self.host.contact_parameters.inertia.any()
         state.rate = wp.zeros(self.worlds if heavy else 0, dtype=self.real, device=self.device)
         return state
 

@@ -12,7 +12,7 @@ from ddg_warp.compile.boundary_conditions import scene_motions
 from ddg_warp.compile.precision import choose, warn_of_rounding
 from ddg_warp.compile.rod_groups import compile_rod_groups
 from ddg_warp.errors import SceneError
-from ddg_warp.io.contact_records import Touching
+from ddg_warp.io.contact_records import ContactScales
 from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.io.shapes import Curves, Surfaces
 from ddg_warp.kernels.elements import element_path
@@ -61,10 +61,12 @@ class Model:
         warn_of_rounding(self, scene.analysis)
 
     def _compile(self, scene) -> None:
-        self.chains = compile_rod_groups(scene)
+        self.rod_group_data = compile_rod_groups(scene)
         self.motions = scene_motions(scene)
         self.grips = [motion for motion in self.motions if isinstance(motion, Grip)]
-        self.groups = [RodGroup(chain, scene, self.worlds, self.wp_device, self.types.real) for chain in self.chains]
+        self.groups = [
+            RodGroup(data, scene, self.worlds, self.wp_device, self.types.real) for data in self.rod_group_data
+        ]
         self.coupled = self._build_net() if needs_coupling(scene) else None
         self.order = UserNumbering(self)
 
@@ -121,13 +123,13 @@ class Model:
         return self.order.obstacles
 
     @property
-    def touching(self) -> Touching | None:
+    def contact_scales(self) -> ContactScales | None:
         """Contact metadata of recordings: labels, sizes, force scale; None without contact."""
-        host = self.coupled.host.touching if self.coupled is not None else None
+        host = self.coupled.host.contact_parameters if self.coupled is not None else None
         if host is None:
             return None
         forces = (host.stiffness * host.range)[host.meeting]
-        return Touching(
+        return ContactScales(
             [body.label for body in host.bodies], host.size, float(np.median(forces)) if forces.size else 1.0
         )
 
@@ -136,7 +138,7 @@ class Model:
         """Contact queries at given states (`ContactModel`); None without contact."""
         from ddg_warp.solve.collision.contact_model import ContactModel
 
-        if self.coupled is None or self.coupled.host.touching is None:
+        if self.coupled is None or self.coupled.host.contact_parameters is None:
             return None
         return ContactModel(self.coupled, self.types.real, self.coupled.rest().q)
 
@@ -473,7 +475,14 @@ def _device(name):
 
 def needs_coupling(scene) -> bool:
     """Return True if a scene has more than uncoupled rods."""
-    parts = scene.shells, scene.joints, scene.attachments, scene.magnets, scene.axisymmetric_shells, scene.touching
+    parts = (
+        scene.shells,
+        scene.joints,
+        scene.attachments,
+        scene.magnets,
+        scene.axisymmetric_shells,
+        scene.contact_parameters,
+    )
     return any(map(bool, parts))
 
 

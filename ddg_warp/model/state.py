@@ -115,7 +115,7 @@ class State:
 
     def __reduce__(self):
         """Have pickle and torch.save keep the arrays, and the model once for all states saved together."""
-        return State._loaded, (self.model, self.snapshot(), self._told())
+        return State._loaded, (self.model, self.snapshot(), self._metadata())
 
     def __copy__(self) -> "State":
         return self.copy()
@@ -123,9 +123,9 @@ class State:
     def __deepcopy__(self, memo) -> "State":
         """Return a copy of the same model, or of the model's copy in `memo`."""
         model = memo.get(id(self.model), self.model)
-        return self.copy() if model is self.model else State._loaded(model, self.snapshot(), self._told())
+        return self.copy() if model is self.model else State._loaded(model, self.snapshot(), self._metadata())
 
-    def _told(self) -> dict:
+    def _metadata(self) -> dict:
         """Return the attributes that a pickle keeps in addition to `snapshot`."""
         attributes = {name: getattr(self, name) for name in (*EQUILIBRIUM, "lead")}
         if self.sliding is not None:
@@ -167,7 +167,7 @@ class State:
         }
 
     @property
-    def rubbing(self) -> wp.array:
+    def slip_velocity(self) -> wp.array:
         """Slip velocities of dof blocks (W N,) for friction."""
         return self.coupled.v if self.sliding is None else self.sliding.velocity
 

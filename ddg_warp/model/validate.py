@@ -39,7 +39,7 @@ def refuse_curved_membranes(model) -> None:
 
 def refuse_friction(model) -> None:
     """Refuse frictional contact in analyses of equilibria that are independent of the load path."""
-    contact = model.coupled.host.touching if model.coupled is not None else None
+    contact = model.coupled.host.contact_parameters if model.coupled is not None else None
     pairs = zip(*contact.meeting, strict=True) if contact is not None else ()
     rough = next(((g, h) for g, h in pairs if contact.friction[g, h] > 0.0), None)
     if rough is None:

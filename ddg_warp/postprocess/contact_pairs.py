@@ -19,9 +19,9 @@ def contacts(model, state) -> Contacts:
     touch = model.touch
     if touch is None:
         raise SceneError("contacts: this scene has no contact; add scene.contact()")
-    touch.at(state.coupled.q, state.coupled.rate)
-    pairs = touch.pairs(state.coupled.q, state.rubbing)
-    owners = {size: touch.shapes.things(size)[2] for size in touch.shapes.sizes}
+    touch.evaluate(state.coupled.q, state.coupled.rate)
+    pairs = touch.pairs(state.coupled.q, state.slip_velocity)
+    owners = {size: touch.shapes.primitives(size)[2] for size in touch.shapes.sizes}
     objects = np.zeros((len(pairs["gap"]), 2), int)
     for size, owner in owners.items():
         for side in range(2):

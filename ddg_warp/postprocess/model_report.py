@@ -17,7 +17,7 @@ from ddg_warp.solve.stepping.step_driver import LinearSolverChoice, choose_solve
 
 SOLVERS = {
     "sweep": "block LDL^T sweep, one Newton loop a rod",
-    "partitioned": "cyclic reduction (few long rods), one Newton loop a rod",
+    "cyclic_reduction": "cyclic reduction (few long rods), one Newton loop a rod",
 }
 CLOSED = "block LDL^T with a Schur complement (closed rods), one Newton loop a rod"
 
@@ -47,9 +47,9 @@ def report(model) -> str:
     if model.coupled is not None:
         lines += coupled_lines(model)
         present |= {part.term.name for part in model.coupled.sets}
-        if touching := model.coupled.host.touching:
-            potentials = contact_potentials(touching)
-            lines += contact_lines(touching)
+        if contact_parameters := model.coupled.host.contact_parameters:
+            potentials = contact_potentials(contact_parameters)
+            lines += contact_lines(contact_parameters)
             lines += [f"  {each.name}: {each.density.name}, {each.text}" for each in potentials]
             present |= {each.name for each in potentials}
     bare = dict.fromkeys(batch.name for batch in model.scene.batches if batch.section.radius is None)
@@ -76,32 +76,32 @@ def step_lines(model, errors_of: Callable) -> list[str]:
         model.precision, LinearSolverChoice(model.types.linear), *(each.max(initial=0.0) for each in errors)
     )
     taken = ["edge-rotation update, exact Hessian"] * means.stiff
-    taken += [f"linear algebra in {means}"] * (means.linear is not model.types.linear or means.split)
+    taken += [f"linear algebra in {means}"] * (means.linear is not model.types.linear or means.mixed_axial)
     return [f"  over steps of {analysis.dt:g} s: {', '.join(taken)}"] if taken else []
 
 
-def contact_lines(touching) -> list[str]:
+def contact_lines(contact_parameters) -> list[str]:
     """Return a line on collision bodies and contact parameters."""
-    law, still = touching.law, sum(body.still for body in touching.bodies)
+    law, still = contact_parameters.law, sum(body.still for body in contact_parameters.bodies)
     numbers = (
-        (touching.range, "range", "m"),
-        (touching.stiffness, "stiffness", "N/m"),
-        (touching.friction[..., None] * touching.ways, "friction", ""),
+        (contact_parameters.range, "range", "m"),
+        (contact_parameters.stiffness, "stiffness", "N/m"),
+        (contact_parameters.friction[..., None] * contact_parameters.ways, "friction", ""),
     )
     said = [f"{name} {_between(values)}{unit and ' ' + unit}" for values, name, unit in numbers]
     said += ["rolling"] * law.rolling
     return [
-        f"contact: {law.name} between {len(touching.bodies) - still} bodies and {still} obstacles, {', '.join(said)}"
+        f"contact: {law.name} between {len(contact_parameters.bodies) - still} bodies and {still} obstacles, {', '.join(said)}"
     ]
 
 
-def contact_potentials(touching) -> list[Potential]:
+def contact_potentials(contact_parameters) -> list[Potential]:
     """Return the potentials of all pair lists: two edges always, other collisions if such bodies are present."""
-    law, kinds = touching.law, {body.kind for body in touching.bodies}
+    law, kinds = contact_parameters.law, {body.kind for body in contact_parameters.bodies}
     optional = ((MESH, "point_triangle"), (BALL, "edge_point"), (PLANE, "point_plane"))
     pairs = ["edge_edge", *(name for kind, name in optional if kind in kinds)]
-    friction = [FRICTION[f"friction_{law.friction_law}_{pair}"] for pair in pairs if touching.has_friction]
-    return [*(contact_potential(law.name, touching.density, pair) for pair in pairs), *friction]
+    friction = [FRICTION[f"friction_{law.friction_law}_{pair}"] for pair in pairs if contact_parameters.has_friction]
+    return [*(contact_potential(law.name, contact_parameters.density, pair) for pair in pairs), *friction]
 
 
 def _between(values: np.ndarray) -> str:
@@ -113,8 +113,8 @@ def coupled_lines(model) -> list[str]:
     """Return lines on dofs, terms and matrix of the coupled system."""
     host, coupled = model.coupled.host, model.coupled
     name, linear = coupled_preconditioner(coupled), model.types.linear
-    chains = RodSubstructuring.of(coupled, name)
-    table = SparseSystem(coupled, chains and chains.kept)
+    substructuring = RodSubstructuring.of(coupled, name)
+    table = SparseSystem(coupled, substructuring and substructuring.kept)
     lines = [
         f"coupled system: {len(host.shells)} shells of {sum(len(s.surface.triangles) for s in host.shells)} triangles, "
         f"{len(host.rods)} rods; {host.nodes} nodes, {host.angles} angles, {host.spins} rigid joints, "
@@ -125,13 +125,13 @@ def coupled_lines(model) -> list[str]:
         lines.append(f"  {part.term.name}: {part.elements * model.worlds} elements, {measure} x {density}")
     if host.drag:
         lines.append(f"  drag on {host.drag[0].shape[1]} edges of rods, implicit")
-    reals, solver, bands, split = 9 * table.positions, f"PCG ({name})", "", False
-    if chains and chains.banded:
-        chains.plan.bind(host, table.rows.numpy(), table.columns.numpy(), chains.kept)
-        solver = "substructuring, exact" if chains.plan.complete and not host.touching else solver
-        split = chains.splits
-        places, block = int(chains.plan.count.sum()), chains.plan.block
-        reals += 3 * block**2 * chains.plan.chain.size
+    reals, solver, bands, mixed_axial = 9 * table.positions, f"PCG ({name})", "", False
+    if substructuring and substructuring.banded:
+        substructuring.plan.bind(host, table.rows.numpy(), table.columns.numpy(), substructuring.kept)
+        solver = "substructuring, exact" if substructuring.plan.complete and not host.contact_parameters else solver
+        mixed_axial = substructuring.allows_mixed_axial
+        places, block = int(substructuring.plan.count.sum()), substructuring.plan.block
+        reals += 3 * block**2 * substructuring.plan.path.size
         bands = f" and {places} path nodes in bands of {block} x {block}"
     size = reals * model.worlds * (4 if linear.__name__ == "float32" else 8)
     lines.append(
@@ -141,7 +141,8 @@ def coupled_lines(model) -> list[str]:
     if uncoupled(model):
         lines.append("  in steps without pairs in range: uncoupled rods, one Newton loop a rod")
     return lines + step_lines(
-        model, lambda s: (model.coupled.rod_errors(s), model.coupled.split_errors(s) if split else np.array([np.inf]))
+        model,
+        lambda s: (model.coupled.rod_errors(s), model.coupled.split_errors(s) if mixed_axial else np.array([np.inf])),
     )
 
 

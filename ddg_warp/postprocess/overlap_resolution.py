@@ -37,13 +37,13 @@ def resolve_overlaps(model, state, gap: float | None = None):
         raise SceneError("resolve_overlaps: this scene has no contact; add scene.contact()")
     coupled, host = model.coupled, model.coupled.host
     least = (
-        PART * float(host.touching.range.min())
+        PART * float(host.contact_parameters.range.min())
         if gap is None
         else argument_checks.positive("resolve_overlaps: gap", gap, "m")
     )
-    if least > touch.search.reach:
+    if least > touch.search.search_distance:
         raise SceneError(
-            f"resolve_overlaps: gap is {least:.6g} m; it may not exceed the search distance, {touch.search.reach:.6g} m"
+            f"resolve_overlaps: gap is {least:.6g} m; it may not exceed the search distance, {touch.search.search_distance:.6g} m"
         )
     new = state.copy()
     start = new.coupled.q.numpy().reshape(-1, 3).astype(float)

@@ -11,7 +11,7 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from ddg_warp.run.run_directory import FULL, PICTURES, SUMMARY, RunDirectory, refuse_to_replace, told
+from ddg_warp.run.run_directory import FULL, PICTURES, SUMMARY, RunDirectory, refuse_to_replace, system_error
 from ddg_warp.run.scene_registry import (
     RUN_SETTINGS,
     InputError,
@@ -70,7 +70,7 @@ def _of_location(error: Exception) -> Exception:
             f"{path}: {error.strerror}: compiled kernels are kept in {cache}, which cannot be written to; name another by the "
             "variable WARP_CACHE_PATH"
         )
-    return told(path, error)
+    return system_error(path, error)
 
 
 def parser(arguments: list[str]) -> Parser:
@@ -422,7 +422,7 @@ def export_run(chosen: argparse.Namespace) -> int:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise told(target, error) from error
+        raise system_error(target, error) from error
     with refused():
         export_usd(source, target, tube=chosen.tube, revolve=chosen.revolve)
     print(f"wrote {target}")

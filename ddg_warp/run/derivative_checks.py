@@ -185,9 +185,9 @@ CHECKS = {
 
 
 def samples_of(
-    term: Term | Potential, precision: str = "float64", device: str = "cpu", chains: tuple[bool, ...] = (False, True)
+    term: Term | Potential, precision: str = "float64", device: str = "cpu", closures: tuple[bool, ...] = (False, True)
 ) -> list[Sample]:
-    """Return the samples of a term: open and closed rods (`chains`), indexed elements, or collisions of a potential.
+    """Return the samples of a term: open and closed rods (`closures`), indexed elements, or collisions of a potential.
 
     Raises:
         ValueError: a planar measure other than the rods'.
@@ -195,7 +195,7 @@ def samples_of(
     if isinstance(term, Potential):
         return [(FrictionSample if term.frictional else ContactSample)(term, None, precision, device)]
     if term.measure in {rod_term.measure for rod_term in REGISTRY.values()}:
-        return [RodSample(term, rods_of(term, closed), precision, device) for closed in chains]
+        return [RodSample(term, rods_of(term, closed), precision, device) for closed in closures]
     if term.measure.dim != 3:
         raise ValueError(f"{term.name}: of the plane are measures of rods alone; give {term.measure.name} dim = 3")
     return [Elements(term, None, precision, device)]
@@ -206,7 +206,7 @@ def checks_of(sample: Sample) -> list[str]:
     left_out = set(sample.LEFT_OUT)
     if isinstance(sample, Elements) and not sample.measure.packed:
         left_out.add("exact")
-    if isinstance(sample, RodSample | Elements) and not sample.term.rest and sample.chain != "open":
+    if isinstance(sample, RodSample | Elements) and not sample.term.rest and sample.layout != "open":
         left_out.add("rest")
     single = sample.precision == "float32"
     return [name for name, check in CHECKS.items() if name not in left_out and not (single and check[2] is None)]
@@ -216,18 +216,18 @@ def table(
     term: str | Term | Potential | None = None,
     precision: str = "float64",
     device: str = "cpu",
-    chains: tuple[bool, ...] = (False, True),
+    closures: tuple[bool, ...] = (False, True),
 ) -> list[dict]:
-    """Return the rows of the derivative table: term, chain, check, error, tolerance, passed.
+    """Return the rows of the derivative table: term, layout, check, error, tolerance, passed.
 
     Args:
         term: a term or potential, user-defined or by its key in `kernels.terms.ALL`; by default all.
         precision: precision of the kernels under test, "float64" or "float32".
         device: Warp device.
-        chains: for terms of rods, open (False) or closed rods (True), or both.
+        closures: for terms of rods, open (False) or closed rods (True), or both.
     """
     terms = ALL.values() if term is None else [ALL[term] if isinstance(term, str) else term]
-    samples = (sample for one in terms for sample in samples_of(one, precision, device, chains))
+    samples = (sample for one in terms for sample in samples_of(one, precision, device, closures))
     return [row(sample, check) for sample in samples for check in checks_of(sample)]
 
 
@@ -237,7 +237,7 @@ def row(sample: Sample, check: str) -> dict:
     value, tolerance = error(sample), tolerances[sample.precision == "float32"]
     return {
         "term": sample.term.key,
-        "chain": sample.chain,
+        "layout": sample.layout,
         "check": check,
         "error": value,
         "tolerance": tolerance,

@@ -19,7 +19,7 @@ class Sample:
     """A term at a random state. Kernels run in float64, the precision of references, unless given another type.
 
     Attributes:
-        chain: label "open" or "closed" of rods, "net" of indexed elements, or "pair" of collisions.
+        layout: label "open" or "closed" of rods, "coupled" of indexed elements, or "pair" of collisions.
         real: type under test.
         shape: shape of arrays with one value for each element: (E,), for rods (n, R).
         data: inputs of the kernels by name, all of order one: dofs q, lagged data, parameters and constants.
@@ -29,7 +29,7 @@ class Sample:
         grid: dimensions of a launch over the elements; index: index of the term in its storage.
     """
 
-    chain = "net"
+    layout = "coupled"
     ORDERS = (0, 1)  # orders of derivatives with a reverse mode: energy, gradient
     LEFT_OUT = frozenset()  # checks that do not apply
     STEP = 1e-4  # step of differences

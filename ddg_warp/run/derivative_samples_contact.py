@@ -6,7 +6,7 @@ The kernels are the ones of steps and adjoints. Each of eight collisions is a wo
 import numpy as np
 import warp as wp
 
-from ddg_warp.kernels.adjoint.contact import FRICTION, NUMBERS, RATE, pull_kernel, rub_kernel
+from ddg_warp.kernels.adjoint.contact import FRICTION, NUMBERS, RATE, friction_jacobian_kernel, pull_kernel
 from ddg_warp.kernels.collision.contact.assembly import PAIR_NODES, ROW, WEIGHT, factor_struct
 from ddg_warp.kernels.collision.contact.closest_points import (
     distance_function,
@@ -44,7 +44,7 @@ class ContactSample(Sample):
         data: q (nodes, 3), first nodes of all collisions first; buffer (parameters, E).
     """
 
-    chain, dim, COUNT, ORDERS = "pair", 3, 8, (1,)
+    layout, dim, COUNT, ORDERS = "pair", 3, 8, (1,)
     LEFT_OUT = frozenset({"gradient", "lagged", "rest", "rigid"})
     POSITIONS = ("q",)
 
@@ -326,7 +326,7 @@ class FrictionSample(ContactSample):
         inputs = [1, pairs, count, *law[:2], self._places(), no_pair, used, lagged, start, law[2], w, VELOCITY, rate]
         parts, numbers = [self._parts(real) for _ in range(3)], self._numbers(real)
         tables = [wp.zeros((0, 0), dtype=real, device=device) for _ in range(2)]
-        kernel = rub_kernel(self.collision, self.law, self.friction, real, False, False, False)
+        kernel = friction_jacobian_kernel(self.collision, self.law, self.friction, real, False, False, False)
         inputs += [no_pair, no_table, no_four, no_vector]
         wp.launch(kernel, 1, inputs, [*parts, numbers, no_vector, *tables], device=device)
         slopes, numbers = (

@@ -35,7 +35,7 @@ class RodSample(Sample):
     INPUTS = ("x", "theta", "frame", "last", "rate", "buffer")
 
     def __init__(self, term: Term, kind: RodKind, *arguments):
-        self.chain, self.count = "closed" if kind.closed else "open", np.array([6, 5])
+        self.layout, self.count = "closed" if kind.closed else "open", np.array([6, 5])
         self.index, self.grid, self.column = (
             kind.terms.index(term),
             self.shape,

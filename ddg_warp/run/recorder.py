@@ -12,7 +12,16 @@ from ddg_warp.io.contact_records import Contacts
 from ddg_warp.io.observed import checked_attributes, checked_notes, checked_observed
 from ddg_warp.io.shapes import Shapes
 from ddg_warp.postprocess.fields import CELL_FIELDS, POINT_FIELDS, check_fields, directors_at_points
-from ddg_warp.run.run_directory import FULL, SCENE, TRAJECTORY, VIEW, RecordError, RunDirectory, refuse_to_replace, told
+from ddg_warp.run.run_directory import (
+    FULL,
+    SCENE,
+    TRAJECTORY,
+    VIEW,
+    RecordError,
+    RunDirectory,
+    refuse_to_replace,
+    system_error,
+)
 
 DEFAULT_FPS = 24.0
 LEAST_DT = 1e-300  # [s], with a finite inverse
@@ -108,7 +117,7 @@ class Recorder:
         self._wanted = check_fields(fields)
         if set(self._wanted) & set(CELL_FIELDS) and model.surfaces is None:
             raise ValueError(f"fields = {fields!r}: the model has no surfaces; leave out {', '.join(CELL_FIELDS)}")
-        if contacts and model.touching is None:
+        if contacts and model.contact_scales is None:
             raise ValueError("contacts: the model has no contact; add scene.contact(), or leave contacts out")
         self._contacts = contacts
         if color_by is not None and (not isinstance(color_by, tuple | list) or len(color_by) != 3):
@@ -141,7 +150,7 @@ class Recorder:
                 self._held.clear(*((TRAJECTORY, VIEW) if hdf5 else ()), *((SCENE,) if usd else ()))
         except BaseException as error:
             self._abandon()
-            raise self._told(error) from error
+            raise self._described(error) from error
 
     def _open_trajectory(self, resume: bool, block: int, wanted: dict, time: str | None) -> None:
         """Begin the trajectory, or continue it with its fields."""
@@ -188,7 +197,7 @@ class Recorder:
             color_by=self._color_by,
             attributes=attributes,
             obstacles=model.obstacles,
-            touching=model.touching if self._contacts else None,
+            contact_scales=model.contact_scales if self._contacts else None,
         )
 
     def __enter__(self) -> Recorder:
@@ -246,7 +255,7 @@ class Recorder:
                 self._show(time, state.points(), velocities, fields | self._colors(state), *bodies_and_contacts)
         except OSError as error:
             self._abandon()
-            raise self._told(error) from error
+            raise self._described(error) from error
 
     def _passes_over(self, state) -> bool:
         """Return True if a state is the checkpoint of a resumed run.
@@ -280,7 +289,7 @@ class Recorder:
                 if writer is not None:
                     writer.close()
         except OSError as error:
-            raise self._told(error) from error
+            raise self._described(error) from error
         finally:
             self._abandon()
 
@@ -293,13 +302,13 @@ class Recorder:
             self._held.close()
         self._held = None
 
-    def _told(self, error: BaseException) -> BaseException:
+    def _described(self, error: BaseException) -> BaseException:
         """Return the error, or for one of the disk a RecordError with losses and remedy."""
         if not isinstance(error, OSError) or isinstance(error, RecordError) or error.errno is None:
             return error
         kept = "the run cannot be recorded any further. "
         kept += "Its complete blocks of frames are kept: " if error.errno in FULL else "Complete frames are kept; "
-        return told(self.directory, error, kept)
+        return system_error(self.directory, error, kept)
 
     def _replay(self) -> None:
         """Write the frames of the trajectory to the scene, and set counters to the end."""
@@ -412,7 +421,7 @@ def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False
     except OSError as error:
         if isinstance(error, ValueError) or error.errno is None:
             raise
-        raise told(path, error) from error
+        raise system_error(path, error) from error
 
 
 def _export(trajectory, path, fps: float | None, tube: bool, revolve: int) -> None:
@@ -430,7 +439,10 @@ def _export(trajectory, path, fps: float | None, tube: bool, revolve: int) -> No
         first = reader.points[0].reshape(-1, 3)[:count]
         revolved = Revolution(reader.curves, first, revolve) if revolve else None
         shapes = revolved.shapes if revolved else shapes
-        options = {"obstacles": reader.obstacles, "touching": reader.touching if reader.contacts is not None else None}
+        options = {
+            "obstacles": reader.obstacles,
+            "contact_scales": reader.contact_scales if reader.contacts is not None else None,
+        }
         options = {} if revolved else options | {"attributes": reader.attributes}
         with CurvesWriter(path, shapes, fps=fps or frame_rate(spacing), tube=tube, **options) as writer:
             shape = (worlds, reader.points.shape[-2])

@@ -26,7 +26,7 @@ class TakenError(RecordError, FileExistsError):
     """Refusal of a directory: a run, another process or a file is in it."""
 
 
-def told(path, error: OSError, kept: str = "") -> RecordError:
+def system_error(path, error: OSError, kept: str = "") -> RecordError:
     """Return an error that names the path, the reason and a remedy.
 
     Args:
@@ -97,7 +97,9 @@ class RunDirectory(os.PathLike):
                 "or move it away"
             ) from error
         except OSError as error:
-            raise told(self.path, error, "no run can be recorded there; " * (error.errno not in FULL)) from error
+            raise system_error(
+                self.path, error, "no run can be recorded there; " * (error.errno not in FULL)
+            ) from error
 
     def __fspath__(self) -> str:
         return str(self.path)

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from ddg_warp.run.run_directory import told
+from ddg_warp.run.run_directory import system_error
 
 BLANK = ("measured", "reference", "error", "tolerance")
 PACKAGES = ("ddg-warp", "warp-lang", "numpy", "scipy", "h5py", "usd-core", "matplotlib", "torch")
@@ -44,7 +44,7 @@ def summary(scene: str, parameters: Mapping, result, checks: Iterable) -> dict:
         "checks": [check.as_dict() for check in checks],
     }
     if "contact" in statistics:
-        content["contact"] = {"law": result.scene.touching.name, **statistics["contact"]}
+        content["contact"] = {"law": result.scene.contact_parameters.name, **statistics["contact"]}
     if result.counted_from is not None:
         content["counted_from"] = result.counted_from
     if result.dt is None:
@@ -85,7 +85,7 @@ def write_json(path: str | Path, content) -> None:
         finally:
             partial.unlink(missing_ok=True)
     except OSError as error:
-        raise told(path, error) from error
+        raise system_error(path, error) from error
 
 
 def write_table(stem: Path, rows: list[Mapping], origin: Mapping) -> None:

@@ -103,7 +103,9 @@ class Step(torch.autograd.Function):
     @staticmethod
     def vmap(info, in_dims, call: Call, *tensors):
         axes = call.axes
-        return _folded(Step, info.batch_size, in_dims, call, tensors, axes, call.state_axes + [0] * call.engine.told)
+        return _folded(
+            Step, info.batch_size, in_dims, call, tensors, axes, call.state_axes + [0] * call.engine.extra_outputs
+        )
 
 
 class Balance(torch.autograd.Function):
@@ -165,7 +167,7 @@ class Pull(torch.autograd.Function):
     @staticmethod
     def forward(call: Call, *tensors):
         engine, count = call.engine_as_then(), len(call.fields)
-        results = count + engine.told
+        results = count + engine.extra_outputs
         cotangent, tensors = tensors[-count:], tensors[:-count]
         output, tensors = tensors[-results:], tensors[:-results]
         state, parameters, controls = call.split(tensors)
@@ -190,7 +192,7 @@ class Pull(torch.autograd.Function):
     def vmap(info, in_dims, call: Call, *tensors):
         axes = call.axes
         smooth = [field.axis for field in call.fields if field.smooth]
-        all_axes = [*axes, *call.state_axes, *[0] * call.engine.told, *call.state_axes]
+        all_axes = [*axes, *call.state_axes, *[0] * call.engine.extra_outputs, *call.state_axes]
         return _folded(Pull, info.batch_size, in_dims, call, tensors, all_axes, smooth + axes[len(call.fields) :])
 
 

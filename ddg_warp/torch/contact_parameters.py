@@ -18,7 +18,7 @@ def contact_elements(model, name: str) -> list:
 
     They are pairs of object names, or labels of bodies; an empty list without contact.
     """
-    contact = model.coupled.host.touching if model.coupled is not None else None
+    contact = model.coupled.host.contact_parameters if model.coupled is not None else None
     if contact is None or (name == "contact.friction" and not contact.has_friction):
         return []
     if name == RADIUS:
@@ -28,7 +28,7 @@ def contact_elements(model, name: str) -> list:
 
 def sized(model, shells: bool) -> dict[int, int]:
     """Return {row of "contact.radius": shell index} of bodies whose radius follows from a rod section or a shell thickness."""
-    contact = model.coupled.host.touching if model.coupled is not None else None
+    contact = model.coupled.host.contact_parameters if model.coupled is not None else None
     if contact is None:
         return {}
     bodies = [contact.bodies[i] for i in _round(contact)]
@@ -47,14 +47,14 @@ class ContactParameterView:
     Attributes: see `TermParameterView`.
     """
 
-    chain = weighs = False
+    is_rod_group = weighs = False
 
     def __init__(self, model, name: str):
-        contact, coupled = model.coupled.host.touching, model.coupled
+        contact, coupled = model.coupled.host.contact_parameters, model.coupled
         self.model, self.name, self.memory, self.key = model, name, self, ("contact", name)
         parameter = name.partition(".")[2]
-        self._view, usual = view(coupled.touching[parameter]), contact.numbers[parameter]
-        self._reach = contact.reach * (1.0 + ROUNDING)
+        self._view, usual = view(coupled.contact_parameters[parameter]), contact.numbers[parameter]
+        self._search_distance = contact.search_distance * (1.0 + ROUNDING)
         indices = (_round(contact),) if name == RADIUS else contact.meeting
         self._usual = np.tile(usual[indices], (model.worlds, 1))
         self._at = [torch.as_tensor(index, device=self._view.device) for index in indices]
@@ -78,12 +78,12 @@ class ContactParameterView:
             SceneError: an activation distance exceeds the search distance; this check reads from the device.
         """
         ((_, values),) = entries
-        if self.name == "contact.range" and bool((values > self._reach).any()):
-            world, pair = (int(i) for i in torch.nonzero(values > self._reach)[0])
+        if self.name == "contact.range" and bool((values > self._search_distance).any()):
+            world, pair = (int(i) for i in torch.nonzero(values > self._search_distance)[0])
             one, second = contact_elements(self.model, self.name)[pair]
             raise SceneError(
                 f"parameters: contact.range of {one!r} and {second!r} is {float(values[world, pair]):.6g} m in world {world}, beyond "
-                f"the search distance {self._reach:.6g} m; build the scene with the largest range in use"
+                f"the search distance {self._search_distance:.6g} m; build the scene with the largest range in use"
             )
         usual = torch.as_tensor(self._usual, dtype=values.dtype, device=values.device)
         # Collision detection runs over all worlds at once, refused ones included.
@@ -99,7 +99,7 @@ class ContactParameterView:
             (bodies,) = self._at
             return view(inputs[-1].radius)[:, bodies] * flags[-1][:, None]
         first, second = self._at
-        gradient = view(inputs[-1].touching)[ROWS[self.name]]
+        gradient = view(inputs[-1].contact_parameters)[ROWS[self.name]]
         transposed = torch.where(first == second, 0.0, gradient[:, second, first])
         return (gradient[:, first, second] + transposed) * flags[-1][:, None]
 

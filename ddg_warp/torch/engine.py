@@ -76,8 +76,8 @@ class Engine:
         self.integrator._worlds.watch()
         self.tables.invalid = view(self.integrator._worlds.invalid)
         self._codes = wp.zeros(worlds, dtype=int, device=model.wp_device)
-        self.codes, self._resting = view(self._codes), self.integrator._worlds.resting
-        self._told_of = Notice(model.wp_device)
+        self.codes, self._outcome_codes = view(self._codes), self.integrator._worlds.outcome_codes
+        self._outputs_of = Notice(model.wp_device)
 
     def follow(self, source) -> None:
         """Copy changed parameters and rest shapes of the user's model."""
@@ -91,7 +91,7 @@ class Engine:
     @property
     def lost(self) -> bool:
         """True if a step or backward pass had no gradient in a world, as far as the device has reported yet."""
-        return self._told_of.given
+        return self._outputs_of.given
 
     # steps
 
@@ -109,7 +109,7 @@ class Engine:
         self.controls.give(controls)
         integrator.advance(0, start, dt, anew=True)
         s = integrator._solved(dt)
-        wp.copy(self._codes, self._resting)
+        wp.copy(self._codes, self._outcome_codes)
         results = copies(self.target) + [self._smooth(part, s, graded) for part in integrator._parts]
         return [*results, self.codes.clone(), *(self.lagged() if graded else [])]
 
@@ -169,7 +169,7 @@ class Engine:
             flag_array = wp.ones(len(islands), dtype=real, device=device)
             none = 2 * [wp.zeros((0, 0, 0), dtype=real, device=device)]
             read = [*islands.arrays, int(predictor is not None), *(frames or none), part.islands_each]
-            read += [flag_array, self._codes, self._told_of.array]
+            read += [flag_array, self._codes, self._outputs_of.array]
             launch = wp.launch(smooth_kernel(real), len(islands), read, device=device, record_cmd=True)
             self._flagged[key] = part, predictor, launch, flag_array, view(flag_array)
         _, predictor, launch, _, flags = self._flagged[key]
@@ -204,7 +204,7 @@ class Engine:
         self.fill(self.source, before)
         self.fill([self.target[i] for i in self._read], [after[i] for i in self._read])
         self.fill(self._by_state, cotangent)
-        self.fill(self._told_places, other_results)
+        self.fill(self._output_places, other_results)
         if adjoint.upload(start, dt, self.tables.given):
             self._graphs.clear()
         self._graphs.replay("clean", self._clean)
@@ -252,7 +252,7 @@ class Engine:
         lost.zero_()
         for adjoint, flags, result_flags, requested in zip(self.adjoint.parts, *self._flags, strict=True):
             failed = adjoint.solve.failed
-            outputs = [result_flags, requested, lost, self._told_of.array]
+            outputs = [result_flags, requested, lost, self._outputs_of.array]
             wp.launch(self._solves, failed.shape, [failed, flags], outputs, device=failed.device)
         wp.capture_if(lost, self._ask)
 
@@ -272,7 +272,9 @@ class Engine:
             adjoint = Adjoint(self.integrator)
             self._given = self.model.empty_state()
             self._by_state = tensors(self._given, self.fields)
-            unread = {f"{i}/{name}" for i, chain in enumerate(adjoint.chains) for name in chain.unread}
+            unread = {
+                f"{i}/{name}" for i, rod_adjoint in enumerate(adjoint.rod_adjoints) for name in rod_adjoint.unread
+            }
             self._read = [i for i, field in enumerate(self.fields) if field.name not in unread]
             self._graphs = Graphs(self.model, self._load)
             # same layout as states, so that a graph can copy it
@@ -310,7 +312,7 @@ class Engine:
         ]
         self._flag_tensors = [view(result_flags) for result_flags in self._flags[1]]
         kept = self._coupled.lagged if self.adjoint.coupled else []
-        self._told_places = [view(place) for place in (*self._flags[0], self._codes_then, *kept)]
+        self._output_places = [view(place) for place in (*self._flags[0], self._codes_then, *kept)]
 
     def _load(self) -> None:
         kernels = [kernel for adjoint in self.adjoint.parts for kernel in adjoint.kernels]
@@ -447,7 +449,7 @@ class Engine:
         return len(self.integrator._parts)
 
     @property
-    def told(self) -> int:
+    def extra_outputs(self) -> int:
         """Maximum number of tensors that `forward` returns besides the state."""
         return self.parts + 1 + len(self.solutions)
 

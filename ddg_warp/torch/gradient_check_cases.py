@@ -61,7 +61,7 @@ class Case:
         self.simulator = self.built()
         self.engine = self.simulator.engine(WORLDS)
         self.model = self.engine.model
-        contact = self.model.coupled.host.touching if self.model.coupled is not None else None
+        contact = self.model.coupled.host.contact_parameters if self.model.coupled is not None else None
         self.slides = self.statics and contact is not None and contact.has_friction
         axisymmetric = bool(self.model.scene.axisymmetric_shells)  # gravity is along z
         flat = axisymmetric or self.model.scene.dimension == 2

@@ -53,7 +53,7 @@ class _Part:
     """Storage of a parameter in one subsystem: arguments of `ArrayParameterView`, and the user rows of its elements."""
 
     index: int
-    chain: bool
+    is_rod_group: bool
     key: object
     usual: np.ndarray
     places: np.ndarray
@@ -79,7 +79,7 @@ def array_views(model, name: str) -> tuple[int, list[ArrayParameterView | contac
         ArrayParameterView(
             model,
             part.index,
-            part.chain,
+            part.is_rod_group,
             part.key,
             part.usual,
             part.places,

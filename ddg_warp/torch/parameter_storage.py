@@ -15,16 +15,18 @@ class TermParameterView:
     Attributes:
         key: key of the memory that tensors are written to.
         memory: parameter table; may also hold other parameters.
-        chain: True for a rod group with tensors (n, W R), False for an element set with (W, E).
+        is_rod_group: True for a rod group with tensors (n, W R), False for an element set with (W, E).
         weighs: True for a mass.
         elements: index of each entry among all elements, padding included, (n, R) or (E,).
         inside: of a rod group, mask of entries that are no padding (n, R).
     """
 
-    def __init__(self, model, index: int, chain: bool, name: str, elements: np.ndarray, inside: np.ndarray | None):
-        self.model, self.index, self.chain, self.inside = model, index, chain, inside
-        self.memory = (model.groups if chain else model.coupled.sets)[index].parameters
-        self.name = name if chain else name.rpartition(".")[2]
+    def __init__(
+        self, model, index: int, is_rod_group: bool, name: str, elements: np.ndarray, inside: np.ndarray | None
+    ):
+        self.model, self.index, self.is_rod_group, self.inside = model, index, is_rod_group, inside
+        self.memory = (model.groups if is_rod_group else model.coupled.sets)[index].parameters
+        self.name = name if is_rod_group else name.rpartition(".")[2]
         self.key = id(self.memory), self.name
         self._row = list(self.memory.values).index(self.name)
         self._rest = self.name.rpartition(".")[2].startswith("rest")
@@ -37,12 +39,12 @@ class TermParameterView:
     def shape(self) -> tuple[int, int]:
         """Shape of the tensors written."""
         worlds, elements = self.model.worlds, self.elements
-        return (elements.shape[0], worlds * elements.shape[1]) if self.chain else (worlds, len(elements))
+        return (elements.shape[0], worlds * elements.shape[1]) if self.is_rod_group else (worlds, len(elements))
 
     def values(self) -> np.ndarray:
         """Return elements without padding, and values (W, elements) of the model."""
         stored = np.broadcast_to(self.memory[self.name], self.shape)
-        if not self.chain:
+        if not self.is_rod_group:
             return self._numbers, stored
         wide = stored.reshape(len(stored), self.model.worlds, -1).transpose(1, 0, 2)
         return self._numbers[self.inside], wide[:, self.inside]
@@ -53,7 +55,7 @@ class TermParameterView:
             values = wide[:, :1].expand(len(wide), self.elements.numel())
         else:  # the backward pass of index_select adds to each element once, hence in a fixed order
             values = wide.index_select(1, self.elements.reshape(-1))
-        if self.chain:
+        if self.is_rod_group:
             values = values.reshape(len(wide), *self.elements.shape).permute(1, 0, 2).reshape(len(self.elements), -1)
         return values
 
@@ -84,7 +86,7 @@ class TermParameterView:
 
     def vjp(self, inputs: list, flags) -> torch.Tensor:
         """Return the gradient by the values written."""
-        if self.chain:
+        if self.is_rod_group:
             array = inputs[self.index].parameters
             if self._by is not array:  # memory is reused from step to step
                 self._by, self._by_view = array, view(array)
@@ -124,8 +126,10 @@ class ArrayParameterView:
         heavy: the `RodGroup` or `CoupledModel` with these masses; None for other parameters.
     """
 
-    def __init__(self, model, index, chain, key, usual, places, elements, brought, count, look, gradient, heavy=None):
-        self.model, self.index, self.chain, self.key = model, index, chain, (index, key)
+    def __init__(
+        self, model, index, is_rod_group, key, usual, places, elements, brought, count, look, gradient, heavy=None
+    ):
+        self.model, self.index, self.is_rod_group, self.key = model, index, is_rod_group, (index, key)
         self._found, self._heavy, self._view, self._rests = gradient, heavy, look(), {}
         self.weighs = heavy is not None
         self.memory, self.usual = self, usual
@@ -145,7 +149,7 @@ class ArrayParameterView:
         """Return values (W, elements) in storage layout; zero where there is no element."""
         padded = torch.cat([wide, wide.new_zeros((len(wide), 1))], 1)
         values = padded.index_select(1, self.rows.reshape(-1)).reshape(len(wide), *self.rows.shape).sum(-1)
-        return values.permute(1, 0, 2).reshape(len(self.rows), -1) if self.chain else values
+        return values.permute(1, 0, 2).reshape(len(self.rows), -1) if self.is_rod_group else values
 
     def widen(self) -> bool:
         """Return False: storage always has a value per world."""
@@ -169,7 +173,7 @@ class ArrayParameterView:
         gradient = self._found(inputs[self.index])
         if gradient is None:
             return torch.zeros_like(self._restored)
-        return gradient * (flags[self.index] if self.chain else flags[-1][:, None])
+        return gradient * (flags[self.index] if self.is_rod_group else flags[-1][:, None])
 
     def _rest(self, places: list) -> torch.Tensor:
         """Return the contributions of all other storages."""
@@ -183,8 +187,8 @@ class ArrayParameterView:
 
     def _tensor(self, usual: np.ndarray) -> torch.Tensor:
         worlds = self.model.worlds
-        wide = np.tile(usual, (1, worlds)) if self.chain else np.tile(usual, (worlds, 1))
+        wide = np.tile(usual, (1, worlds)) if self.is_rod_group else np.tile(usual, (worlds, 1))
         return torch.as_tensor(wide, dtype=self._view.dtype, device=self._view.device)
 
     def _assign(self, total: torch.Tensor) -> None:
-        self._view.copy_(total if self.chain else total.unsqueeze(-1))
+        self._view.copy_(total if self.is_rod_group else total.unsqueeze(-1))

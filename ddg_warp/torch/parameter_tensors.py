@@ -201,7 +201,7 @@ class ParameterTensors:
     def _bad(self, place, value: torch.Tensor) -> torch.Tensor:
         """Return a mask of worlds with NaN in the values written to a storage (worlds,)."""
         is_nan = torch.isnan(value)
-        return is_nan.view(len(is_nan), self.model.worlds, -1).any(2).any(0) if place.chain else is_nan.any(1)
+        return is_nan.view(len(is_nan), self.model.worlds, -1).any(2).any(0) if place.is_rod_group else is_nan.any(1)
 
     @property
     def given(self) -> bool:
@@ -215,7 +215,7 @@ class ParameterTensors:
 
     def axes(self, names: tuple) -> list[int]:
         """Return the world axes of full parameters."""
-        return [int(place.chain) for name in names for place in self.of(name)[1]]
+        return [int(place.is_rod_group) for name in names for place in self.of(name)[1]]
 
     def vjp(self, names: tuple, inputs: list, flags) -> list[torch.Tensor]:
         """Return the gradients by full parameters, in the order of `write`."""

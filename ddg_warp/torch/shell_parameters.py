@@ -99,10 +99,10 @@ class ShellParameters(torch.nn.Module):
         if self._weighs:
             values["_mass"] = usual_values(simulator, "shell.mass")
             values |= _vertices(model, [i for i, *_ in chosen])
-        self._touching = {}
+        self._half_thicknesses = {}
         if "thickness" in names:
-            self._touching = _half_thicknesses(model, [i for i, *_ in chosen], counts)
-        if self._touching:
+            self._half_thicknesses = _half_thicknesses(model, [i for i, *_ in chosen], counts)
+        if self._half_thicknesses:
             values["_half_thickness"] = usual_values(simulator, contact_parameters.RADIUS)
         for name, value in values.items():
             self.register_buffer(name, value if value is None else value.detach().to(device).clone())
@@ -163,10 +163,12 @@ class ShellParameters(torch.nn.Module):
             more = torch.expm1(sum(self._spread(self.changes[name]) for name in HEAVY if name in self.changes))
             more = torch.nn.functional.pad(more * self._corner_mass, (0, 1))[:, self._corners]
             result["shell.mass"] = self._mass + more.sum(-1)
-        if self._touching:
-            half = [0.5 * quantities["thickness"][:, triangles].amax(-1) for triangles in self._touching.values()]
+        if self._half_thicknesses:
+            half = [
+                0.5 * quantities["thickness"][:, triangles].amax(-1) for triangles in self._half_thicknesses.values()
+            ]
             usual = self._half_thickness.expand(len(half[0]), -1)
-            rows = torch.as_tensor(list(self._touching), device=usual.device)
+            rows = torch.as_tensor(list(self._half_thicknesses), device=usual.device)
             result[contact_parameters.RADIUS] = usual.index_copy(1, rows, torch.stack(half, -1).to(usual.dtype))
         return result
 

@@ -51,7 +51,7 @@ def pull_kernel(kind: Kind, density: Density, real):
     by_rate_of = by_rate_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def pull(
+    def vjp(
         threads: int,
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
@@ -78,11 +78,13 @@ def pull_kernel(kind: Kind, density: Density, real):
                 numbers[wp.static(STIFFNESS), pair] = real(0.0)
                 numbers[wp.static(RATE), pair] = dp[0] * grad_inverse_step
 
-    return pull
+    return vjp
 
 
 @cache
-def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: bool, spins: bool, rolls: bool):
+def friction_jacobian_kernel(
+    kind: Kind, density: Density, friction: Density, real, directed: bool, spins: bool, rolls: bool
+):
     """Build the kernel of derivatives of friction by local node index of the solution, the start and the lagged positions.
 
     Derivatives by parameters of pairs are as in `pull_kernel`. `directed` or `rolls`: also by the directions of rods (capacity,);
@@ -147,7 +149,7 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
         return wp.dot(f, E(wp.dot(t1, along), wp.dot(t2, along)))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def rub(
+    def friction_vjp(
         threads: int,
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
@@ -250,4 +252,4 @@ def rub_kernel(kind: Kind, density: Density, friction: Density, real, directed: 
                             spun_out[wp.static(TURN) + i, pair] = dturn[i]
                         spun_out[wp.static(ARM), pair] = darm
 
-    return rub
+    return friction_vjp

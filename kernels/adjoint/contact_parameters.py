@@ -114,13 +114,13 @@ def side_kernels(kind: Kind, real):
 def direction_kernels(real):
     """Build the kernels of gradients by directions of first primitives.
 
-    `things`: sum gradients by the direction of each first primitive.
+    `primitives`: sum gradients by the direction of each first primitive.
     `gather`: add them to the two nodes of each direction.
     """
     V = wp.types.vector(3, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def things(
+    def primitives(
         count: wp.array(dtype=int),
         starts: wp.array(dtype=int),
         partners: wp.array(dtype=int),
@@ -152,7 +152,7 @@ def direction_kernels(real):
             value += wp.where(items[index] % 2 == 1, gradient, -gradient)
         out[w, k] = out[w, k] + value
 
-    return things, gather
+    return primitives, gather
 
 
 @cache

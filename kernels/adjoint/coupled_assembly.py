@@ -13,7 +13,7 @@ from ddg_warp.kernels.elements.variation import transported_function
 def frame_kernel(real):
     """Build the kernel of frame updates, the reverse of `kernels.elements.coupled_frames.edge_kernel`.
 
-    `pull`: write gradients by the edge vector, and add gradients by the previous frame.
+    `vjp`: write gradients by the edge vector, and add gradients by the previous frame.
     """
     V = wp.types.vector(3, real)
     carried = transported_function(real)
@@ -23,7 +23,7 @@ def frame_kernel(real):
         return V(a[row, f], a[row + 1, f], a[row + 2, f])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def pull(
+    def vjp(
         q: wp.array(dtype=V),
         ends: wp.array2d(dtype=int),
         blocks: int,
@@ -45,7 +45,7 @@ def frame_kernel(real):
             frame_out[d, f] = frame_out[d, f] + du[d]
             frame_out[3 + d, f] = frame_out[3 + d, f] + dt[d]
 
-    return pull
+    return vjp
 
 
 @cache

@@ -43,19 +43,21 @@ def block_kernels(real, linear):
 def chain_rule_kernel(real):
     """Build the kernel of right-hand sides of a solve that uses a lagged solution.
 
-    `chain`: write the gradient by the lagged solution, given the gradient by a later solution.
+    `vjp_by_lagged`: write the gradient by the lagged solution, given the gradient by a later solution.
     """
     V = wp.types.vector(3, real)
     _, free = product_functions(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def chain(bits: wp.array(dtype=wp.uint8), blocks: int, by_lagged: wp.array(dtype=V), grad_q: wp.array(dtype=V)):
+    def vjp_by_lagged(
+        bits: wp.array(dtype=wp.uint8), blocks: int, by_lagged: wp.array(dtype=V), grad_q: wp.array(dtype=V)
+    ):
         """Replace gradients at free dofs by `by_lagged`, and add it at fixed dofs, which are equal in both solutions."""
         i = wp.tid()
         grad_q[i] = grad_q[i] - wp.cw_mul(grad_q[i], free(bits[i % blocks])) + by_lagged[i]
         by_lagged[i] = V()
 
-    return chain
+    return vjp_by_lagged
 
 
 @cache

@@ -21,7 +21,7 @@ def predictor_kernels(real, midpoint: bool):
     `unplace`: write gradients by excesses, add gradients by anchors, of the rods of one level; one thread a rod.
     `pass_on`: add the gradients by anchors to their nodes, one thread a block.
     `turn`: write gradients by base and step of every edge.
-    `pull`: add gradients by the start of every block.
+    `vjp`: add gradients by the start of every block.
 
     Levels of the rod order are taken in reverse.
     """
@@ -178,7 +178,7 @@ def predictor_kernels(real, midpoint: bool):
         step_out[w, p] = by_step
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def pull(
+    def vjp(
         cotangent: wp.array(dtype=V),
         along: wp.array(dtype=V),
         placed: wp.array(dtype=wp.uint8),
@@ -241,4 +241,4 @@ def predictor_kernels(real, midpoint: bool):
         v_out[i] = v_out[i] + grad_inverse_step / rates[w]
         rate_out[i] = rate_out[i] - wp.dot(grad_inverse_step, v0[i]) / (rates[w] * rates[w])
 
-    return unplace, pass_on, turn, pull
+    return unplace, pass_on, turn, vjp

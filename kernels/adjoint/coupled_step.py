@@ -16,7 +16,7 @@ from ddg_warp.kernels.terms import Term
 def lag_kernel(term: Term, real):
     """Build the kernel of gradients by an element's own lagged rows.
 
-    `pull`: reverse `kernels.elements.coupled_frames.lag_kernel`, and add.
+    `vjp`: reverse `kernels.elements.coupled_frames.lag_kernel`, and add.
     """
     Elements, measure = elements_type(real), term.measure
     V = wp.types.vector(3, real)
@@ -32,7 +32,7 @@ def lag_kernel(term: Term, real):
         return wp.dot(advance(q, s), f)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def pull(
+    def vjp(
         inputs: Elements,
         cotangent: wp.array2d(dtype=real),
         slot_out: wp.array2d(dtype=V),
@@ -50,7 +50,7 @@ def lag_kernel(term: Term, real):
         for i in range(wp.static(data)):
             lag_out[i, tid] = lag_out[i, tid] + ds[i]
 
-    return pull
+    return vjp
 
 
 @cache

@@ -49,7 +49,7 @@ def _write_functions(storage: ElementStorage, index: int, real, adds: bool):
 def pull_kernel(storage: ElementStorage, index: int, real, adds: bool, measured: bool):
     """Build the reverse of the element forces of a term: derivatives of -w . dE/dq by all inputs of an element.
 
-    `pull`: write the derivatives by the window, lagged and constant data, rest measure, parameters in the rows of the term,
+    `vjp`: write the derivatives by the window, lagged and constant data, rest measure, parameters in the rows of the term,
     and strains of the last step. Add the derivative by the inverse step length.
 
     Args:
@@ -73,7 +73,7 @@ def pull_kernel(storage: ElementStorage, index: int, real, adds: bool, measured:
     Displacements, measured = storage.Displacements, adds or measured
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def pull(
+    def vjp(
         inputs: Inputs,
         w: Displacements,
         window_out: Rows,
@@ -107,14 +107,14 @@ def pull_kernel(storage: ElementStorage, index: int, real, adds: bool, measured:
                 last_out[wp.static(strain) + m, column] = dp[wp.static(rows) + m]
             rate_out[column] = rate_out[column] + dp[wp.static(size - 1)]
 
-    return pull
+    return vjp
 
 
 @cache
 def strain_kernel(storage: ElementStorage, index: int, real, adds: bool):
     """Build the reverse of the strains of a term: derivatives by window, lagged and constant data, and rest measure.
 
-    `pull`: write them, or add them with `adds`, from the derivatives by strains.
+    `vjp`: write them, or add them with `adds`, from the derivatives by strains.
     """
     access, Inputs = storage.terms[index], storage.Inputs
     term, local, short, spread = access.term, access.local, access.short, access.spread
@@ -130,7 +130,7 @@ def strain_kernel(storage: ElementStorage, index: int, real, adds: bool):
     )
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def pull(
+    def vjp(
         inputs: Inputs,
         cotangent: wp.array2d(dtype=real),
         window_out: Rows,
@@ -154,4 +154,4 @@ def strain_kernel(storage: ElementStorage, index: int, real, adds: bool):
             dmeasure += parameter_out[wp.static(row), column]
         parameter_out[wp.static(row), column] = dmeasure
 
-    return pull
+    return vjp

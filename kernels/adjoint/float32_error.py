@@ -24,7 +24,7 @@ def stiffness_kernels(kind: RodKind, real):
     """Build the kernels of the estimate.
 
     `measure`: write stiffnesses and mass of every segment of every rod.
-    `judge`: set `poor` if the float32 error of a rod exceeds the allowed one.
+    `flag`: set `poor` if the float32 error of a rod exceeds the allowed one.
     """
     *_, parameter = gather_functions(kind, real)
     rows = []
@@ -66,7 +66,7 @@ def stiffness_kernels(kind: RodKind, real):
         out[wp.static(MASS), segment, r] = total
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def judge(
+    def flag(
         rows: wp.array3d(dtype=real),
         length: wp.array(dtype=real),
         count: wp.array(dtype=int),
@@ -90,4 +90,4 @@ def stiffness_kernels(kind: RodKind, real):
         if not (real(wp.static(half)) * stiffest <= allowed * softest):
             wp.atomic_max(poor, 0, 1)
 
-    return measure, judge
+    return measure, flag

@@ -35,7 +35,7 @@ def put_function(kind: RodKind, real, first: bool):
 def frame_kernel(kind: RodKind, real, unit: bool = True, first: bool = True):
     """Build the kernel of gradients by frames.
 
-    `pull`: reverse `kernels.stepping.rod_step.finish_frames_kernel`, or without `unit` the frame update `relag` of
+    `vjp`: reverse `kernels.stepping.rod_step.finish_frames_kernel`, or without `unit` the frame update `relag` of
     `kernels.newton.rod_iterate`. Frames are written; the first edges of element windows are written if `first`, else added to.
 
     The reference twist is recomputed at every state; the lagged one only selects its multiple of 2 pi.
@@ -51,7 +51,7 @@ def frame_kernel(kind: RodKind, real, unit: bool = True, first: bool = True):
         return X(a[row, k, r], a[row + 1, k, r], a[row + 2, k, r])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def pull(
+    def vjp(
         x: wp.array2d(dtype=V),
         frame: wp.array3d(dtype=real),
         count: wp.array(dtype=int),
@@ -74,7 +74,7 @@ def frame_kernel(kind: RodKind, real, unit: bool = True, first: bool = True):
             frame_out[3 + d, k, r] = dt[d]
         put(window_out, k, r, f)
 
-    return pull
+    return vjp
 
 
 @cache

@@ -17,7 +17,7 @@ from ddg_warp.kernels.stepping.rod_step import predicted_function
 def predict_kernel(kind: RodKind, real, midpoint: bool):
     """Build the kernel of predictors of `time_step.begin_kernel` and `rod_step.predict_kernel` of `kernels.stepping`, one thread a rod.
 
-    `pull`: add gradients by fixed dofs, by positions and velocities at the start, and by the rate.
+    `vjp`: add gradients by fixed dofs, by positions and velocities at the start, and by the rate.
 
     `excess_out` and `added_out` are scratch.
     """
@@ -87,7 +87,7 @@ def predict_kernel(kind: RodKind, real, midpoint: bool):
         return by_e, by_step
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def pull(
+    def vjp(
         x: wp.array2d(dtype=V),
         x0: wp.array2d(dtype=V),
         v0: wp.array2d(dtype=V),
@@ -168,4 +168,4 @@ def predict_kernel(kind: RodKind, real, midpoint: bool):
             v_out[k, r] = v_out[k, r] + grad_inverse_step / rate
             rate_out[k, r] = rate_out[k, r] - wp.dot(grad_inverse_step, v0[k, r]) / (rate * rate)
 
-    return pull
+    return vjp

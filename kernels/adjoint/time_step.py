@@ -188,7 +188,7 @@ def step_kernels(nodes: NodeStorage, real, midpoint: bool, drag: bool):
 def angle_kernel(dim: int, real, midpoint: bool):
     """Build the kernel of twist angles with prescribed motion, the reverse of `kernels.forces.prescribed_motion.support_kernels`.
 
-    `pull`: add gradients by nodes of edges (component, node, column) and by previous frames; write gradients by prescribed directors.
+    `vjp`: add gradients by nodes of edges (component, node, column) and by previous frames; write gradients by prescribed directors.
     """
     X, V = wp.types.vector(3, real), wp.types.vector(dim, real)
     get, _ = point_functions(dim, real)
@@ -198,7 +198,7 @@ def angle_kernel(dim: int, real, midpoint: bool):
     planar = dim == 2
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def pull(
+    def vjp(
         where: wp.array2d(dtype=int),
         rest: wp.array(dtype=X),
         pose: wp.array2d(dtype=real),
@@ -231,7 +231,7 @@ def angle_kernel(dim: int, real, midpoint: bool):
             wp.atomic_add(node_out, c, where[i, 3] / columns, r, by_node)
             wp.atomic_sub(node_out, c, where[i, 2] / columns, r, by_node)
 
-    return pull
+    return vjp
 
 
 @cache

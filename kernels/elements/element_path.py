@@ -259,7 +259,7 @@ def drop_compression_function(real, tensions: int):
 
 
 @cache
-def evaluate_function(storage: ElementStorage, index: int, real, linear, curved: bool, split: bool):
+def evaluate_function(storage: ElementStorage, index: int, real, linear, curved: bool, mixed_axial: bool):
     """Return the device function `evaluate_at` of one term: write its factor, tensions and second derivatives.
 
     It returns energy, derivative with respect to the window, and the largest stiffness of a strain. A term that is alone writes its
@@ -283,7 +283,7 @@ def evaluate_function(storage: ElementStorage, index: int, real, linear, curved:
     )
     write = write_function(storage, linear, real) if storage.slots else write_rows_function(Q, linear, real)
     rows = storage.num_slots or measure.size
-    splits, bends = split and tensions > 0, curved and curvature_of is not None
+    splits, bends = mixed_axial and tensions > 0, curved and curvature_of is not None
     drop_compression = drop_compression_function(real, tensions)
     left_out, carried_part = left_out_function(term, real), stiffness_split_function(real)
     alone, write_gradient = len(storage.terms) == 1, write_function(storage, real, real)
@@ -370,7 +370,7 @@ def evaluate_kernel(
     real,
     linear,
     curved: bool = False,
-    split: bool = False,
+    mixed_axial: bool = False,
     project: bool = False,
     reuse: bool = False,
 ):
@@ -383,7 +383,7 @@ def evaluate_kernel(
     Args:
         curved: True if second derivatives are written, from iteration `exact_from` on; with the factor, compression included, they
             make the exact Hessian. False for a Gauss-Newton matrix.
-        split: True if rows of edges have only the stiffness that the matrix carries, and slacks are written; see
+        mixed_axial: True if rows of edges have only the stiffness that the matrix carries, and slacks are written; see
             `kernels.linear.mixed_axial_force`.
         project: True if all islands drop compression, second derivatives or not.
         reuse: True if factors are written at the first iterate of a step only.
@@ -397,7 +397,7 @@ def evaluate_kernel(
     # 0.3 s each. Recursion costs 5 % of a step on the CPU.
     terms, everywhere = len(measures), measures[0].span == 1 or len(measures) == 1
     several = terms > 1
-    first_term, last_term = (evaluate_function(storage, index, real, linear, curved, split) for index in (0, -1))
+    first_term, last_term = (evaluate_function(storage, index, real, linear, curved, mixed_axial) for index in (0, -1))
     stale = next((m.stale(real) for m in measures if m.stale), None)
     packed = max(m.packed for m in measures) if curved else 0
     options = CPU_OPTIONS | {"max_unroll": packed} if packed else CPU_OPTIONS

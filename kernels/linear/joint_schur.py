@@ -68,7 +68,7 @@ def joint_kernels(linear):
         return inverse, definite
 
     @wp.func
-    def pull(
+    def matrix_row_product(
         matrix: wp.array2d(dtype=linear),
         columns: wp.array(dtype=int),
         starts: wp.array(dtype=int),
@@ -135,7 +135,7 @@ def joint_kernels(linear):
         if a >= 0:
             for d in range(3):
                 shift = (colour[m] * size + d) * all_columns + w * width
-                y = pull(matrix, columns, starts, items, values, where, width, nodes, 2 * m, first, shift)
+                y = matrix_row_product(matrix, columns, starts, items, values, where, width, nodes, 2 * m, first, shift)
                 for e in range(3):
                     aa[e, d] = y[e]
             f = free(fixed[a])
@@ -146,11 +146,15 @@ def joint_kernels(linear):
         if b >= 0:
             for d in range(3):
                 shift = (colour[m] * size + 3 + d) * all_columns + w * width
-                y = pull(matrix, columns, starts, items, values, where, width, nodes, 2 * m + 1, first, shift)
+                y = matrix_row_product(
+                    matrix, columns, starts, items, values, where, width, nodes, 2 * m + 1, first, shift
+                )
                 for e in range(3):
                     bb[e, d] = y[e]
                 if a >= 0:
-                    y = pull(matrix, columns, starts, items, values, where, width, nodes, 2 * m, first, shift)
+                    y = matrix_row_product(
+                        matrix, columns, starts, items, values, where, width, nodes, 2 * m, first, shift
+                    )
                     for e in range(3):
                         ab[e, d] = y[e]
             f = free(fixed[b])
@@ -198,11 +202,13 @@ def joint_kernels(linear):
         t = H()
         if a >= 0:
             t = residual[a + w * blocks]
-            t -= pull(matrix, columns, starts, items, values, where, width, nodes, 2 * m, first, shift)
+            t -= matrix_row_product(matrix, columns, starts, items, values, where, width, nodes, 2 * m, first, shift)
         u = H()
         if b >= 0:
             u = residual[b + w * blocks]
-            u -= pull(matrix, columns, starts, items, values, where, width, nodes, 2 * m + 1, first, shift)
+            u -= matrix_row_product(
+                matrix, columns, starts, items, values, where, width, nodes, 2 * m + 1, first, shift
+            )
         z = parts[2, i] * (u - t * parts[1, i])
         moved_out[2 * i] = parts[0, i] * t - parts[1, i] * z
         moved_out[2 * i + 1] = z

@@ -92,17 +92,17 @@ def functions(size: int, linear):
 
 @cache
 def longer_function(dim: int, real, linear):
-    """Return the device function `longer(slack, pull, per_root, edge, step) -> lengthening` of an edge.
+    """Return the device function `longer(slack, axial_force, per_root, edge, step) -> lengthening` of an edge.
 
-    It follows from the tension or, without slack, from the step. `pull`: tension of the edge. `per_root`: 1 / sqrt(k'). `step`:
+    It follows from the tension or, without slack, from the step. `axial_force`: tension of the edge. `per_root`: 1 / sqrt(k'). `step`:
     difference of the displacements of its nodes.
     """
     V = wp.types.vector(dim, real)
 
     @wp.func
-    def longer(slack: linear, pull: linear, per_root: linear, edge: V, step: V):
+    def longer(slack: linear, axial_force: linear, per_root: linear, edge: V, step: V):
         if slack == linear(0.0):
             return linear(wp.dot(step, edge) / wp.length(edge))
-        return slack * pull * per_root
+        return slack * axial_force * per_root
 
     return longer

@@ -149,14 +149,14 @@ def unpair_kernel(kind: RodKind, real, linear):
             direction_out[d, k, r] = solution[d, k, r]
         if k == n - 1:
             return
-        pull = solution[wp.static(nb), k + 1, r]
+        axial_force = solution[wp.static(nb), k + 1, r]
         if k % 4 == 1:
-            pull = solution[wp.static(nb + 1), k, r]
+            axial_force = solution[wp.static(nb + 1), k, r]
         step = V()
         for d in range(wp.static(dim)):
             step[d] = real(solution[d, k + 1, r] - solution[d, k, r])
         edge = x[k + 1, r] - x[k, r]
         per_root = linear(real(1.0) / wp.sqrt(scalars[MAX_EDGE_STIFFNESS, r]))
-        direction_out[wp.static(nb), k, r] = longer(F[wp.static(slack_row), k, r], pull, per_root, edge, step)
+        direction_out[wp.static(nb), k, r] = longer(F[wp.static(slack_row), k, r], axial_force, per_root, edge, step)
 
     return unpair

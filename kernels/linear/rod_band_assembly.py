@@ -19,13 +19,15 @@ from ddg_warp.kernels.terms import Term
 
 
 @cache
-def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tuple[bool, ...], split: bool = False):
+def sum_function(
+    terms: tuple[Term, ...], twist: bool, real, linear, exact: tuple[bool, ...], mixed_axial: bool = False
+):
     """Return the device function `add(sets, k, c, w, with_second) -> (D, E, F)` at a path node.
 
     It adds the contributions of the last of the terms, and calls itself for the terms before.
     """
     term, curved = terms[-1], exact[-1]
-    measure, nb = term.measure, path_node_dofs(twist, split)
+    measure, nb = term.measure, path_node_dofs(twist, mixed_axial)
     B, M, Along = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear), along_type(real, linear)
     n, size, nodes, angles, tensions = (
         len(measure.strains),
@@ -35,7 +37,7 @@ def sum_function(terms: tuple[Term, ...], twist: bool, real, linear, exact: tupl
         measure.tensions,
     )
     second_of = second_function(measure, linear) if curved else None
-    before = sum_function(terms[:-1], twist, real, linear, exact[:-1], split) if len(terms) > 1 else None
+    before = sum_function(terms[:-1], twist, real, linear, exact[:-1], mixed_axial) if len(terms) > 1 else None
     first, last = len(terms) == 1, len(terms) - 1
     part = part_function(measure, linear)
 
@@ -136,7 +138,7 @@ def layout_type():
     @wp.struct
     class Layout:
         places: wp.array3d(dtype=int)
-        chain: wp.array2d(dtype=int)
+        path: wp.array2d(dtype=int)
         count: wp.array(dtype=int)
         held: wp.array2d(dtype=wp.uint8)
         idle: wp.array(dtype=int)
@@ -155,22 +157,23 @@ def blocks_function(
     linear,
     exact_from: tuple[int | None, ...],
     drag: bool,
-    split: bool = False,
+    mixed_axial: bool = False,
 ):
     """Return the device function `blocks_at(...) -> (D, E, F)` of a path node; fixed dofs have rows of the identity.
 
     `exact_from`: for each term, the first iteration with second derivatives, the same for all, or None without. Without terms all
-    blocks come from positions of H. If `split`, the last dof of a path node is the tension of the edge behind, eliminated after both
-    of its nodes; see `kernels.linear.mixed_axial_force`. A path node without tension has a row of the negative identity.
+        blocks come from positions of H. If `mixed_axial`, the last dof of a path node is the tension of the edge behind, eliminated
+        after both of its nodes; see `kernels.linear.mixed_axial_force`. A path node without tension has a row of the negative
+        identity.
     """
-    nb = path_node_dofs(twist, split)
+    nb = path_node_dofs(twist, mixed_axial)
     parts = 1 + twist  # dof blocks of a path node: node, twist angle of the edge ahead
     B, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     Mass, Layout, Along = mass_type(real, drag), layout_type(), along_type(real, linear)
-    free_of, block_of = path_node_functions(twist, linear, split)
+    free_of, block_of = path_node_functions(twist, linear, mixed_axial)
     late_terms = tuple(first is not None for first in exact_from)
-    add = sum_function(terms, twist, real, linear, late_terms, split) if terms else None
-    tension_behind = edge_behind_function(terms, real, linear) if split else None
+    add = sum_function(terms, twist, real, linear, late_terms, mixed_axial) if terms else None
+    tension_behind = edge_behind_function(terms, real, linear) if mixed_axial else None
     begin = next((first for first in exact_from if first is not None), 0)
 
     @wp.func
@@ -221,7 +224,7 @@ def blocks_function(
         listed = layout.places.shape[0] > wp.static(parts)
         if listed:
             D += block_of(matrix, layout.places, wp.static(parts), k, c, first)
-        if wp.static(split):
+        if wp.static(mixed_axial):
             t, slack = tension_behind(sets, k, c, w)
             D[wp.static(nb - 1), wp.static(nb - 1)] = linear(-1.0)
             if slack > linear(0.0):
@@ -232,10 +235,10 @@ def blocks_function(
         if fixed_here != wp.uint8(0):
             f = free_of(fixed_here)
             D = wp.cw_mul(D, wp.outer(f, f)) + wp.diag(B(linear(1.0)) - f)
-        if k + 1 < n and layout.chain[k + 1, c] == layout.chain[k, c]:
+        if k + 1 < n and layout.path[k + 1, c] == layout.path[k, c]:
             if listed:
                 E += block_of(matrix, layout.places, wp.static(parts + parts**2), k, c, first)
-            if wp.static(split):
+            if wp.static(mixed_axial):
                 t, slack = tension_behind(sets, k + 1, c, w)
                 if slack > linear(0.0):
                     for d in range(3):
@@ -245,7 +248,7 @@ def blocks_function(
         else:
             E = M()
         if wp.static(span == 2):
-            if k + 2 < n and layout.chain[k + 2, c] == layout.chain[k, c]:
+            if k + 2 < n and layout.path[k + 2, c] == layout.path[k, c]:
                 if listed:
                     F += block_of(matrix, layout.places, wp.static(parts + 2 * parts**2), k, c, first)
                 if (fixed_here | layout.held[k + 2, c]) != wp.uint8(0):

@@ -56,7 +56,7 @@ def band_kernels(
     exact_from: tuple[int | None, ...],
     drag: bool,
     serial: bool,
-    split: bool = False,
+    mixed_axial: bool = False,
 ):
     """Build the kernels of bands.
 
@@ -64,14 +64,14 @@ def band_kernels(
     `clear`: zero the positions of H that moved to bands.
     `product`: compute H p on active dofs, and p . H p by block.
     """
-    nb = path_node_dofs(twist, split)
+    nb = path_node_dofs(twist, mixed_axial)
     H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
     Mass, Layout, Along, until = mass_type(real, drag), layout_type(), along_type(real, linear), until_function(serial)
     load, store, _, _ = block_functions(nb, linear)
     along, back = times_functions(nb, linear)
     settle = settle_function(linear)
-    blocks_at = blocks_function(terms, twist, span, real, linear, exact_from, drag, split)
-    value = value_function(twist, linear, split)
+    blocks_at = blocks_function(terms, twist, span, real, linear, exact_from, drag, mixed_axial)
+    value = value_function(twist, linear, mixed_axial)
 
     @wp.kernel(
         module="unique", enable_backward=False, grid_stride=False, launch_bounds=TWO_BLOCKS, module_options=CPU_OPTIONS
@@ -192,17 +192,17 @@ def band_kernels(
 
 
 @cache
-def product_walk_kernel(twist: bool, span: int, linear, split: bool = False):
+def product_walk_kernel(twist: bool, span: int, linear, mixed_axial: bool = False):
     """Build the kernel of the product on the CPU.
 
     `walk`: compute H p path by path; each block is read once, and its transposed product carried to later nodes.
     """
-    nb = path_node_dofs(twist, split)
+    nb = path_node_dofs(twist, mixed_axial)
     H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
     load, _, _, _ = block_functions(nb, linear)
     along, back = times_functions(nb, linear)
     times, free = product_functions(linear)
-    value = value_function(twist, linear, split)
+    value = value_function(twist, linear, mixed_axial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def walk(

@@ -13,19 +13,19 @@ from ddg_warp.kernels.residual.coupled_residual_along_rods import along_type
 from ddg_warp.kernels.terms import Term
 
 
-def path_node_dofs(twist: bool, split: bool = False) -> int:
-    """Return the number of dofs of a path node: position, twist angle ahead (`twist`), tension behind (`split`)."""
-    return 3 + twist + split
+def path_node_dofs(twist: bool, mixed_axial: bool = False) -> int:
+    """Return the number of dofs of a path node: position, twist angle ahead (`twist`), tension behind (`mixed_axial`)."""
+    return 3 + twist + mixed_axial
 
 
 @cache
-def path_node_functions(twist: bool, linear, split: bool = False):
+def path_node_functions(twist: bool, linear, mixed_axial: bool = False):
     """Return the device functions `free_of` and `block_of`.
 
     `free_of(fixed_dofs)`: 1 at free dofs of a path node, 0 at fixed ones, from bits.
     `block_of(...)`: the block of two path nodes, from positions of H.
     """
-    nb = path_node_dofs(twist, split)
+    nb = path_node_dofs(twist, mixed_axial)
     B, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
 
     @wp.func
@@ -61,12 +61,12 @@ def path_node_functions(twist: bool, linear, split: bool = False):
 
 
 @cache
-def gather_function(twist: bool, linear, split: bool = False):
+def gather_function(twist: bool, linear, mixed_axial: bool = False):
     """Return the device function `gather(v, node, angle, shift)`: the dofs of a path node from a vector of dof blocks.
 
     Blocks of its world start at `shift`.
     """
-    H, B = wp.types.vector(3, linear), wp.types.vector(path_node_dofs(twist, split), linear)
+    H, B = wp.types.vector(3, linear), wp.types.vector(path_node_dofs(twist, mixed_axial), linear)
 
     @wp.func
     def gather(v: wp.array(dtype=H), node: int, angle: int, shift: int):
@@ -99,9 +99,9 @@ def angle_function(twist: bool):
 
 
 @cache
-def value_function(twist: bool, linear, split: bool = False):
+def value_function(twist: bool, linear, mixed_axial: bool = False):
     """Return the device function `value(v, places, k, c, shift)`: as `gather_function`, by path node."""
-    H, gather, angle_of = wp.types.vector(3, linear), gather_function(twist, linear, split), angle_function(twist)
+    H, gather, angle_of = wp.types.vector(3, linear), gather_function(twist, linear, mixed_axial), angle_function(twist)
 
     @wp.func
     def value(v: wp.array(dtype=H), places: wp.array3d(dtype=int), k: int, c: int, shift: int):
@@ -111,15 +111,15 @@ def value_function(twist: bool, linear, split: bool = False):
 
 
 @cache
-def solve_functions(twist: bool, linear, split: bool = False):
+def solve_functions(twist: bool, linear, mixed_axial: bool = False):
     """Return the device functions `rhs` and `hand`, for systems that consist of rod paths alone.
 
     `rhs(v, node, angle, fixed_dofs, shift)`: the right-hand side of a path node, zero at fixed dofs.
     `hand(u, b, node, angle, w, shift, z, dots_out)`: write the solution u, of residual b, to its dof blocks in world w.
     """
-    H, B = wp.types.vector(3, linear), wp.types.vector(path_node_dofs(twist, split), linear)
-    free_of, _ = path_node_functions(twist, linear, split)
-    gather = gather_function(twist, linear, split)
+    H, B = wp.types.vector(3, linear), wp.types.vector(path_node_dofs(twist, mixed_axial), linear)
+    free_of, _ = path_node_functions(twist, linear, mixed_axial)
+    gather = gather_function(twist, linear, mixed_axial)
 
     @wp.func
     def rhs(v: wp.array(dtype=H), node: int, angle: int, fixed_dofs: wp.uint8, shift: int):
@@ -144,8 +144,8 @@ def solve_functions(twist: bool, linear, split: bool = False):
     return rhs, hand
 
 
-def splits(term: Term) -> bool:
-    """Return True if the stiffness of a term is axial stiffness of edges, which may be `split`."""
+def allows_mixed_axial(term: Term) -> bool:
+    """Return True if the stiffness of a term is axial stiffness of edges, which may be `mixed_axial`."""
     return term.measure.tensions == len(term.measure.strains) == 1
 
 
@@ -156,7 +156,7 @@ def edge_behind_function(terms: tuple[Term, ...], real, linear):
     The slack is zero for an edge without tension.
     """
     H, Along = wp.types.vector(3, linear), along_type(real, linear)
-    first, which, own_splits = len(terms) == 1, len(terms) - 1, splits(terms[-1])
+    first, which, own_splits = len(terms) == 1, len(terms) - 1, allows_mixed_axial(terms[-1])
     before = None if first else edge_behind_function(terms[:-1], real, linear)
 
     @wp.func

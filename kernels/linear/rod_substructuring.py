@@ -45,17 +45,17 @@ from ddg_warp.kernels.linear.sliced_ell import ALL_INACTIVE
 
 
 @cache
-def serial_path_nodes_kernel(twist: bool, span: int, linear, split: bool = False):
+def serial_path_nodes_kernel(twist: bool, span: int, linear, mixed_axial: bool = False):
     """Build the kernel that solves paths without joints on the CPU, one thread a path.
 
     `solve`: load, solve and finish of `path_kernels` in one.
     """
-    nb = path_node_dofs(twist, split)
+    nb = path_node_dofs(twist, mixed_axial)
     H = wp.types.vector(3, linear)
     _, _, vector, store_vector = block_functions(nb, linear)
-    substitute = substitute_function(nb, span, linear, tensions=int(split))
-    rhs, hand = solve_functions(twist, linear, split)
-    value, angle_of = value_function(twist, linear, split), angle_function(twist)
+    substitute = substitute_function(nb, span, linear, tensions=int(mixed_axial))
+    rhs, hand = solve_functions(twist, linear, mixed_axial)
+    value, angle_of = value_function(twist, linear, mixed_axial), angle_function(twist)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def solve(
@@ -90,7 +90,7 @@ def serial_path_nodes_kernel(twist: bool, span: int, linear, split: bool = False
 
 
 @cache
-def path_kernels(twist: bool, span: int, linear, sides: int, serial: bool, split: bool = False):
+def path_kernels(twist: bool, span: int, linear, sides: int, serial: bool, mixed_axial: bool = False):
     """Build the kernels of substructuring.
 
     `factorise`: factorise H_II.
@@ -102,14 +102,14 @@ def path_kernels(twist: bool, span: int, linear, sides: int, serial: bool, split
     `spread`: write the wanted columns of wanted worlds.
     `note`: mark worlds that lost pivots.
     """
-    nb = path_node_dofs(twist, split)
+    nb = path_node_dofs(twist, mixed_axial)
     parts, angle = 1 + twist, 2 + twist  # dof blocks of a path node (node, twist angle); index of the twist angle
     H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
     _, _, _, store_vector = block_functions(nb, linear)
-    factor = factor_function(nb, span, linear, int(split))
-    substitute = substitute_function(nb, span, linear, tensions=int(split))
+    factor = factor_function(nb, span, linear, int(mixed_axial))
+    substitute = substitute_function(nb, span, linear, tensions=int(mixed_axial))
     substitute_all = substitute_all_function(nb, span, linear, sides)
-    free_of, _ = path_node_functions(twist, linear, split)
+    free_of, _ = path_node_functions(twist, linear, mixed_axial)
     until = until_function(serial)
     multiply, _ = coupling_functions(linear)
 

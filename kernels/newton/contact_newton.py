@@ -63,7 +63,7 @@ def contact_kernels(real, linear, serial: bool):
         flags: wp.array2d(dtype=int),
         kept: wp.array2d(dtype=real),
         change: wp.array(dtype=real),
-        noise: wp.array(dtype=real),
+        rounding_error: wp.array(dtype=real),
     ):
         """Add contact energy to the change since the accepted iterate, and to the rounding.
 
@@ -76,7 +76,7 @@ def contact_kernels(real, linear, serial: bool):
             accepted = flags[ENERGY_BUFFER, w]
             kept[1 - accepted, w] = energy[w]
             change[w] = change[w] + energy[w] - kept[accepted, w]
-            noise[w] = noise[w] + wp.abs(energy[w])
+            rounding_error[w] = rounding_error[w] + wp.abs(energy[w])
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def gain(

@@ -43,7 +43,7 @@ STALLED = 8  # allowed iterations without progress if energy changes are below t
 def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contact: bool = False, crowd: bool = False):
     """Build the kernels of the line search and of updates.
 
-    `judge`: test convergence, accept or shorten an update, and set the forcing term.
+    `decide_action`: test convergence, accept or shorten an update, and set the forcing term.
     `measure`: write the predicted decrease of a direction.
     `rotate`: write the largest rotation of a full update.
     `take`: set the step length of a direction.
@@ -58,13 +58,13 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
     first_item, until = items_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def judge(
+    def decide_action(
         change: wp.array(dtype=real),
-        noise: wp.array(dtype=real),
+        rounding_error: wp.array(dtype=real),
         square: wp.array(dtype=real),
         worst: wp.array(dtype=real),
         rtol: real,
-        floor: real,
+        rounding_factor: real,
         max_iterations: int,
         max_halvings: int,
         loosest: real,
@@ -111,9 +111,17 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
         first = flags[ITERATION, w] == 0
         # zero length: a frame update, which predicts no decrease
         moved = not first and scalars[STEP_LENGTH, w] > real(0.0)
-        below_floor = moved and scalars[PREDICTED_DECREASE, w] <= real(10.0) * noise[w] * floor
+        below_floor = moved and scalars[PREDICTED_DECREASE, w] <= real(10.0) * rounding_error[w] * rounding_factor
         action = decide(
-            change[w], noise[w] * floor, square[w], worst[w], max_iterations, max_halvings, flags, scalars, w
+            change[w],
+            rounding_error[w] * rounding_factor,
+            square[w],
+            worst[w],
+            max_iterations,
+            max_halvings,
+            flags,
+            scalars,
+            w,
         )
         if action == wp.static(STOP):
             return
@@ -263,7 +271,7 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
             d = direction[i]
             q[i] = base[i] + V(real(d[0]), real(d[1]), real(d[2])) * length
 
-    return judge, measure, rotate, take, move
+    return decide_action, measure, rotate, take, move
 
 
 @cache

@@ -187,7 +187,7 @@ def sum_kernels(kind: RodKind, real, linear):
     def weigh(
         residual: wp.array3d(dtype=linear),
         change: wp.array2d(dtype=real),
-        noise: wp.array2d(dtype=linear),
+        rounding_error: wp.array2d(dtype=linear),
         count: wp.array(dtype=int),
         status: wp.array(dtype=int),
         ranges: int,
@@ -203,7 +203,7 @@ def sum_kernels(kind: RodKind, real, linear):
         worst = real(0.0)
         for k in range(i, count[r], ranges):
             total += change[k, r]
-            rounding += real(noise[k, r])
+            rounding += real(rounding_error[k, r])
             for d in range(wp.static(nb)):
                 size = wp.abs(real(residual[d, k, r]))
                 worst = wp.max(worst, size)
@@ -250,7 +250,7 @@ def sum_kernels(kind: RodKind, real, linear):
 def decide_kernels(kind: RodKind, real, exact: bool, fails: bool = False):
     """Build the kernels of decisions from partial sums.
 
-    `judge`: test the iterate of a rod.
+    `decide_action`: test the iterate of a rod.
     `take`: set the step length along a direction.
 
     A lost pivot ends the solve if it `fails`. Otherwise the iterate is repeated without geometric stiffness and compression.
@@ -260,10 +260,10 @@ def decide_kernels(kind: RodKind, real, exact: bool, fails: bool = False):
     out_of_patience = projected_limit_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def judge(
+    def decide_action(
         partial: wp.array3d(dtype=real),
         ranges: int,
-        floor: real,
+        rounding_factor: real,
         max_iterations: int,
         max_halvings: int,
         flags: wp.array2d(dtype=int),
@@ -287,7 +287,9 @@ def decide_kernels(kind: RodKind, real, exact: bool, fails: bool = False):
         if flags[ITERATION, r] == 0:
             flags[LOST_PIVOTS_TOTAL, r] = 0
         taken = scalars[STEP_LENGTH, r]
-        action = decide(total, rounding * floor, square, worst, max_iterations, max_halvings, flags, scalars, r)
+        action = decide(
+            total, rounding * rounding_factor, square, worst, max_iterations, max_halvings, flags, scalars, r
+        )
         if action == wp.static(STOP):
             return
         flags[ANY_ACTIVE, 0] = 1
@@ -341,4 +343,4 @@ def decide_kernels(kind: RodKind, real, exact: bool, fails: bool = False):
             wp.static(MOVE_STRAIGHT),
         )
 
-    return judge, take
+    return decide_action, take

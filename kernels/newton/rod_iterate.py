@@ -18,7 +18,7 @@ ROTATE_EDGES, UPDATE_FRAMES, MOVE_STRAIGHT = (
 
 
 @cache
-def move_functions(kind: RodKind, real, linear, split: bool = False):
+def move_functions(kind: RodKind, real, linear, mixed_axial: bool = False):
     """Return the device functions `step_of`, `excess`, `put_at` and `carry` of one node or edge.
 
     `step_of`: step of a node.
@@ -26,7 +26,7 @@ def move_functions(kind: RodKind, real, linear, split: bool = False):
     `put_at`: write the end position of a node.
     `carry`: transport a frame to the iterate.
 
-    If `split`, directions end with the lengthening of edges; see `kernels.newton.rod_sweep`.
+    If `mixed_axial`, directions end with the lengthening of edges; see `kernels.newton.rod_sweep`.
     """
     dim, block = kind.dim, kind.block
     V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
@@ -62,7 +62,7 @@ def move_functions(kind: RodKind, real, linear, split: bool = False):
         de = (step_of(direction, next_node, r) - step_of(direction, j, r)) * amount
         if extrapolation == wp.static(EXTRAPOLATE_ROTATED):
             return further_of(e, positions[next_node, r] - positions[j, r], de)
-        if wp.static(split):
+        if wp.static(mixed_axial):
             return excess_of(e, de, real(direction[wp.static(block), j, r]) * amount, extrapolation)
         else:
             return excess_of(e, de, along_edge(e, de), extrapolation)
@@ -114,7 +114,7 @@ def shorter_function(real):
 
 
 @cache
-def search_functions(kind: RodKind, real, linear, split: bool = False):
+def search_functions(kind: RodKind, real, linear, mixed_axial: bool = False):
     """Return the device functions `place`, `turn_angles`, `relag` and `shorter` of a line search on a rod.
 
     `place`: take an edge-rotation update.
@@ -125,7 +125,7 @@ def search_functions(kind: RodKind, real, linear, split: bool = False):
     dim, twist, angle, every = kind.dim, kind.twist, kind.block - 1, (1 << kind.dim) - 1
     V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
     _, reference_twist, _ = parallel_transport.functions(real)
-    step_of, excess, put_at, carry = move_functions(kind, real, linear, split)
+    step_of, excess, put_at, carry = move_functions(kind, real, linear, mixed_axial)
     along, *_ = gather_functions(kind, real)
     closed = kind.closed
 
@@ -222,7 +222,7 @@ def search_functions(kind: RodKind, real, linear, split: bool = False):
 
 
 @cache
-def adjust_kernel(kind: RodKind, real, linear, split: bool = False, assembled: bool = False):
+def adjust_kernel(kind: RodKind, real, linear, mixed_axial: bool = False, assembled: bool = False):
     """Build the kernel that completes an iteration.
 
     `adjust`: write a shortened or far-rotating step, or update the frames of its iterate.
@@ -232,8 +232,8 @@ def adjust_kernel(kind: RodKind, real, linear, split: bool = False, assembled: b
     """
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
-    place, turn_angles, relag, _ = search_functions(kind, real, linear, split)
-    step_of, *_ = move_functions(kind, real, linear, split)
+    place, turn_angles, relag, _ = search_functions(kind, real, linear, mixed_axial)
+    step_of, *_ = move_functions(kind, real, linear, mixed_axial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def adjust(

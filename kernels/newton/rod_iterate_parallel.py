@@ -29,7 +29,7 @@ from ddg_warp.kernels.stepping.rod_step import predicted_function
 
 
 @cache
-def move_kernels(kind: RodKind, real, linear, split: bool = False):
+def move_kernels(kind: RodKind, real, linear, mixed_axial: bool = False):
     """Build the kernels of an edge-rotation update or a frame update.
 
     `turn`: compute the excess of rotated edges, or their frames, into a second array as neighbours read the old frames.
@@ -38,7 +38,7 @@ def move_kernels(kind: RodKind, real, linear, split: bool = False):
     """
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
-    step_of, excess, put_node, carry = move_functions(kind, real, linear, split)
+    step_of, excess, put_node, carry = move_functions(kind, real, linear, mixed_axial)
     onward_of = repeat_rotation_function(real)
     _, reference_twist, _ = parallel_transport.functions(real)
 

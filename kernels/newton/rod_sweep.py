@@ -50,14 +50,17 @@ from ddg_warp.kernels.newton.rod_iterate import ROTATE_EDGES, UPDATE_FRAMES, sea
 
 
 @cache
-def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fails: bool = False, split: bool = False):
+def sweep_kernel(
+    kind: RodKind, real, linear, exact_from: int | None = None, fails: bool = False, mixed_axial: bool = False
+):
     """Build the kernel of one Newton iteration for one kind of rod.
 
     `sweep`: eliminate, test the iterate, and shorten the step or take the next one.
 
     From iteration `exact_from` on, the matrix includes the geometric stiffness G. A lost pivot ends the solve if it `fails`.
-    Otherwise the iterate is repeated with `clamped[r]` raised: without compression and, for this iteration, without G. If `split`,
-    factors end with the slack of edges, and directions with the lengthening of edges; see `kernels.linear.mixed_axial_force`.
+    Otherwise the iterate is repeated with `clamped[r]` raised: without compression and, for this iteration, without G. If
+        `mixed_axial`, factors end with the slack of edges, and directions with the lengthening of edges; see
+        `kernels.linear.mixed_axial_force`.
     """
     balanced, _ = line_search_functions(kind.twist, real)
     out_of_patience = projected_limit_function(real)
@@ -66,11 +69,11 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
     V, H, M = wp.types.vector(dim, real), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     factor_block, lower, upper, lower_vector, upper_vector, congruence = block_ldlt.functions(nb, linear)
     *_, shorter = search_functions(kind, real, linear)
-    angle, rows = nb - 1, kind.factor_rows + split
+    angle, rows = nb - 1, kind.factor_rows + mixed_axial
     # Measured: in float64 prefetching takes more registers than a GPU has; 10 % slower on an H200.
     prefetch = kind.serial or linear == wp.float32
     tension_row = 2 * nb2 + nb  # row of the kept data where tensions begin
-    kept_size = tension_row + (mixed_axial_force.kept_rows(nb) if split else 0)
+    kept_size = tension_row + (mixed_axial_force.kept_rows(nb) if mixed_axial else 0)
     Pending, eliminate = mixed_axial_force.functions(nb, linear)
     longer = mixed_axial_force.longer_function(dim, real, linear)
     vertex_rows, edge_rows, tensions = kind.vertex_strains, kind.edge_strains, kind.tensions
@@ -87,7 +90,7 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
         enable_backward=False,
         grid_stride=False,
         launch_bounds=128,
-        enable_cuda_smem_spilling=not split,
+        enable_cuda_smem_spilling=not mixed_axial,
         module_options=CPU_OPTIONS,
     )
     def sweep(
@@ -105,7 +108,7 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
         scalars: wp.array2d(dtype=real),
         fixed: wp.array2d(dtype=wp.uint8),
         # options
-        floor: real,
+        rounding_factor: real,
         rotation_cap: real,
         max_iterations: int,
         max_halvings: int,
@@ -135,10 +138,10 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
         rb = H()
         worst = linear(0.0)  # largest residual
         change = real(0.0)  # of the energy, from the accepted iterate to this one
-        noise = real(0.0)  # rounding of `change`
+        rounding_error = real(0.0)  # rounding of `change`
         newton = real(0.0)  # r^T H^-1 r
         lost_here = int(0)
-        if wp.static(split):
+        if wp.static(mixed_axial):
             pending = Pending()
             pending.pivot = linear(1.0)
         # Prefetch: data of the next node is read before this node is processed, since a sweeping thread mostly waits for memory.
@@ -216,8 +219,8 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
             worst = wp.max(worst, wp.max(wp.abs(rj)))
             if not first:
                 change += more
-                noise += real(rounding)
-            if wp.static(split):
+                rounding_error += real(rounding)
+            if wp.static(mixed_axial):
                 unmasked = H(linear(1.0))
             if mask != wp.uint8(0):
                 free = H()
@@ -228,7 +231,7 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
                 Wab = wp.cw_mul(Wab, rows)
                 Wac = wp.cw_mul(Wac, rows)
                 ra = wp.cw_mul(ra, free)
-                if wp.static(split):
+                if wp.static(mixed_axial):
                     unmasked = free
             # Columns of fixed dofs ahead stay: the solution there is zero, and gathered values are masked with the rows.
 
@@ -237,23 +240,23 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
             z = lower_vector(L, rj + ra)
             newton += real(wp.dot(wp.cw_mul(z, inverse), z))
             y = upper_vector(L, inverse, z)
-            if wp.static(not split):
+            if wp.static(not mixed_axial):
                 for d in range(wp.static(nb)):
                     Y[wp.static(2 * nb2) + d, j, r] = y[d]
             Zb = lower(L, Wab)
-            if wp.static(not split):
+            if wp.static(not mixed_axial):
                 store(Y, 0, j, r, upper(L, inverse, Zb))
             zd = wp.cw_mul(z, inverse)
             ra = rb - zd * Zb
             Waa = Wbb - congruence(Zb, inverse, Zb)
             if wp.static(span == 2):
                 Zc = lower(L, Wac)
-                if wp.static(not split):
+                if wp.static(not mixed_axial):
                     store(Y, wp.static(nb2), j, r, upper(L, inverse, Zc))
                 rb = -(zd * Zc)
                 Wab = Wbc - congruence(Zb, inverse, Zc)
                 Wbb = Wcc - congruence(Zc, inverse, Zc)
-                if wp.static(split):
+                if wp.static(mixed_axial):
                     edge = H()
                     loose = linear(0.0)
                     if j < n - 1:
@@ -317,7 +320,7 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
             return
         if not first and finite:
             expected = taken * scalars[PREDICTED_DECREASE, r]
-            rounding_floor = floor * noise
+            rounding_floor = rounding_factor * rounding_error
             if expected > real(10.0) * rounding_floor:
                 accept = change <= real(-1.0e-4) * expected + rounding_floor
             else:
@@ -357,9 +360,9 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
                 return
         e1 = H()
         e2 = H()
-        if wp.static(split):
-            pulled = linear(0.0)
-            pull = linear(0.0)
+        if wp.static(mixed_axial):
+            next_axial_force = linear(0.0)
+            axial_force = linear(0.0)
             per_root = linear(real(1.0) / wp.sqrt(scalars[MAX_EDGE_STIFFNESS, r]))
         rotation = real(0.0)
         x_ahead = V()
@@ -379,16 +382,16 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
             step = -times(left, Y, 0, j, r, e1)
             if wp.static(span == 2):
                 step -= times(left, Y, wp.static(nb2), j, r, e2)
-            if wp.static(split):
+            if wp.static(mixed_axial):
                 # The tension ahead is known from the node there; the tension of the edge behind is for the node before.
-                tension_behind = left_at(left, Y, wp.static(tension_row + 3 * nb), j, r) * pulled
+                tension_behind = left_at(left, Y, wp.static(tension_row + 3 * nb), j, r) * next_axial_force
                 tension_behind -= left_at(left, Y, wp.static(tension_row + 3 * nb + 1), j, r)
                 for d in range(wp.static(nb)):
-                    step[d] = step[d] - left_at(left, Y, wp.static(tension_row) + d, j, r) * pulled
+                    step[d] = step[d] - left_at(left, Y, wp.static(tension_row) + d, j, r) * next_axial_force
                     tension_behind += left_at(left, Y, wp.static(tension_row + nb) + d, j, r) * e1[d]
                     tension_behind += left_at(left, Y, wp.static(tension_row + 2 * nb) + d, j, r) * e2[d]
-                pull = pulled
-                pulled = tension_behind
+                axial_force = next_axial_force
+                next_axial_force = tension_behind
             for d in range(wp.static(nb)):
                 step[d] = step[d] + left_at(left, Y, wp.static(2 * nb2) + d, j, r)
                 direction[d, j, r] = step[d]
@@ -400,9 +403,9 @@ def sweep_kernel(kind: RodKind, real, linear, exact_from: int | None = None, fai
             if i > 0:
                 span_sq = wp.length_sq(x_ahead - x_j)
                 rotation = wp.max(rotation, wp.length_sq(bent) / span_sq)
-                if wp.static(split):
+                if wp.static(mixed_axial):
                     slack = F[wp.static(slack_row), j, r]
-                    direction[wp.static(nb), j, r] = longer(slack, pull, per_root, x_ahead - x_j, bent)
+                    direction[wp.static(nb), j, r] = longer(slack, axial_force, per_root, x_ahead - x_j, bent)
             x_ahead = x_j
             x[j, r] = x_j + dx
             if wp.static(twist):

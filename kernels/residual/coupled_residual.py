@@ -77,7 +77,7 @@ def inputs_type(real, drag: bool):
         longest: real
         settled: real
         rtol: real
-        floor: real
+        rounding_factor: real
         push: wp.array(dtype=V)
         pressed: wp.array(dtype=real)
 
@@ -89,7 +89,7 @@ def results_type(real, linear):
     """Return the struct of outputs of the residual.
 
     `rhs`: residuals of free dofs. `least`: rounding floor. `ratio`, `square`: residual over its tolerance, and squared.
-    `change`, `noise`: change of the energy along the step from `base`, and its rounding.
+    `change`, `rounding_error`: change of the energy along the step from `base`, and its rounding.
     """
     H = wp.types.vector(3, linear)
 
@@ -100,7 +100,7 @@ def results_type(real, linear):
         ratio: wp.array2d(dtype=real)
         square: wp.array2d(dtype=real)
         change: wp.array2d(dtype=real)
-        noise: wp.array2d(dtype=real)
+        rounding_error: wp.array2d(dtype=real)
 
     return Found
 
@@ -195,22 +195,22 @@ def residual_functions(real, linear, drag: bool, contact: bool, angle: bool = Fa
         size: real,
         stiff: real,
         change: real,
-        noise: real,
+        rounding_error: real,
     ):
         """Write the residual and test convergence by the criterion of `kernels.residual.rod_residual`."""
         mask = int(inputs.fixed[k])
-        reach = largest(dofs_of(inputs.q[i])) + inputs.longest
+        magnitude = largest(dofs_of(inputs.q[i])) + inputs.longest
         length = real(1.0)
         if wp.static(angle):
-            reach += real(1.0)
+            magnitude += real(1.0)
             length = inputs.arm
         else:
             if k >= inputs.nodes:
-                reach += real(1.0)
+                magnitude += real(1.0)
                 length = inputs.arm
         allowed = inputs.allowed[i]
         limit = inputs.rtol * load_scale * allowed
-        least = inputs.floor * (stiff * reach + size)
+        least = inputs.rounding_factor * (stiff * magnitude + size)
         outputs.least[i] = least
         r = H()
         total = real(0.0)
@@ -238,7 +238,7 @@ def residual_functions(real, linear, drag: bool, contact: bool, angle: bool = Fa
         outputs.ratio[w, k] = worst / allowed
         outputs.square[w, k] = total / (length * length)
         outputs.change[w, k] = change
-        outputs.noise[w, k] = noise + real(0.5) * size * reach
+        outputs.rounding_error[w, k] = rounding_error + real(0.5) * size * magnitude
 
     return outer, settle
 
@@ -302,7 +302,7 @@ def balance_kernel(real, linear, drag: bool, contact: bool, serial: bool):
                 k = some[k]
             i = k + w * inputs.blocks
             force, size, stiff, change = outer(inputs, i, k, w, scalars[INERTIA_COEFFICIENT, w])
-            noise = wp.abs(change)
+            rounding_error = wp.abs(change)
             accepted = flags[ENERGY_BUFFER, w]
             for n in range(sets.shape[0]):
                 element_set = sets[n]
@@ -327,10 +327,10 @@ def balance_kernel(real, linear, drag: bool, contact: bool, serial: bool):
                 size += large
                 stiff += real(stiffness)
                 change += more
-                noise += rounding
+                rounding_error += rounding
             if oblique.shape[0] > 0:
                 if oblique[k] >= 0:
                     force = frames[oblique[k]] * force
-            settle(inputs, outputs, flags, scalars[LOAD_SCALE, w], i, k, w, force, size, stiff, change, noise)
+            settle(inputs, outputs, flags, scalars[LOAD_SCALE, w], i, k, w, force, size, stiff, change, rounding_error)
 
     return balance

@@ -65,9 +65,9 @@ def force_function(terms: tuple[Term, ...], real, linear):
         size_too = real(0.0)
         stiff_too = real(0.0)
         change = real(0.0)
-        noise = real(0.0)
+        rounding_error = real(0.0)
         if wp.static(not first):
-            force, size, stiff, moment, size_too, stiff_too, change, noise = before(sets, k, c, w, accepted)
+            force, size, stiff, moment, size_too, stiff_too, change, rounding_error = before(sets, k, c, w, accepted)
         for i in range(wp.static(nodes)):
             e = elements.at[i, k, c]
             if e >= 0:
@@ -80,14 +80,14 @@ def force_function(terms: tuple[Term, ...], real, linear):
                 if i == 0:
                     new = elements.energy[1 - accepted, e]
                     change += new - elements.energy[accepted, e]
-                    noise += wp.abs(new)
+                    rounding_error += wp.abs(new)
                 if wp.static(angles > 0):
                     if i < wp.static(angles):
                         m = elements.gradient[wp.static(measure.size - angles) + i, e]
                         moment += m
                         size_too += wp.abs(m)
                         stiff_too += stiffness
-        return force, size, stiff, moment, size_too, stiff_too, change, noise
+        return force, size, stiff, moment, size_too, stiff_too, change, rounding_error
 
     return collect
 
@@ -125,7 +125,7 @@ def path_node_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: b
         accepted = flags[ENERGY_BUFFER, w]
         shift = first_of(w, inputs.blocks)
         for k in range(start, until(start, count[c])):
-            f, size, stiff, moment, size_too, stiff_too, change, noise = collect(sets, k, c, w, accepted)
+            f, size, stiff, moment, size_too, stiff_too, change, rounding_error = collect(sets, k, c, w, accepted)
             node = places[0, k, c]
             if node >= 0:
                 if elsewhere[node] == wp.uint8(0):
@@ -143,7 +143,7 @@ def path_node_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: b
                         large + size,
                         rigid + stiff,
                         work + change,
-                        wp.abs(work) + noise,
+                        wp.abs(work) + rounding_error,
                     )
             if wp.static(twist):
                 angle = places[1, k, c]

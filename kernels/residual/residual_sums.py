@@ -59,10 +59,10 @@ def cluster_kernel(real, linear, leaf: bool, serial: bool):
                 i = items[entry] + w * below
                 v = value[i]
                 total += V(real(v[0]), real(v[1]), real(v[2]))
-                noise = rounding[i]
+                rounding_error = rounding[i]
                 if wp.static(leaf):
-                    noise *= noise
-                square += noise
+                    rounding_error *= rounding_error
+                square += rounding_error
             i = cluster + w * limit.shape[1]
             value_out[i] = total
             rounding_out[i] = square

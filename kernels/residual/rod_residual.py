@@ -127,8 +127,8 @@ def check_kernel(kind: RodKind, real, linear):
     `check`: write residual and energy change at every node, and set `not_converged` of rods with a residual above tolerance and floor.
 
     `below_rounding_floor` is set if a residual is above the tolerance but within the floor. Residuals of fixed dofs are zero.
-    `noise` bounds the rounding of `change`, the sum of element energy differences and of the work of inertia and loads along the
-    step.
+    `rounding_error` bounds the rounding of `change`, the sum of element energy differences and of the work of inertia and loads
+    along the step.
     """
     dim, nb, twist, closed, drag = kind.dim, kind.block, kind.twist, kind.closed, kind.drag
     V, Inertia = wp.types.vector(dim, real), inertia_type(kind, real)
@@ -159,7 +159,7 @@ def check_kernel(kind: RodKind, real, linear):
         fixed: wp.array2d(dtype=wp.uint8),
         length: wp.array(dtype=real),
         rtol: real,
-        floor: real,
+        rounding_factor: real,
         right_out: wp.array3d(dtype=linear),
         change_out: wp.array2d(dtype=real),
         noise_out: wp.array2d(dtype=linear),
@@ -192,10 +192,10 @@ def check_kernel(kind: RodKind, real, linear):
                 m = mass[k, r].mass
             else:
                 m = mass[k, r]
-            reach = wp.max(wp.abs(position))
-            least = floor * ((real(2.0) * stiff + c * m) * reach + size)
+            magnitude = wp.max(wp.abs(position))
+            least = rounding_factor * ((real(2.0) * stiff + c * m) * magnitude + size)
             if wp.static(drag):
-                least += floor * wp.max(wp.get_diag(mass[k, r].resistance)) * reach
+                least += rounding_factor * wp.max(wp.get_diag(mass[k, r].resistance)) * magnitude
             mask = int(fixed[k, r])
             for d in range(wp.static(dim)):
                 is_fixed = ((mask >> d) & 1) == 1
@@ -213,8 +213,8 @@ def check_kernel(kind: RodKind, real, linear):
                 if not is_fixed and not wp.abs(moment) <= limit * length[r]:
                     flags[BELOW_ROUNDING_FLOOR, r] = 1
                     arm = wp.length(x[along(k + 1, n), r] - position)
-                    least = floor * (
-                        real(2.0) * stiff * arm * arm * reach / length[r]
+                    least = rounding_factor * (
+                        real(2.0) * stiff * arm * arm * magnitude / length[r]
                         + c * rotary[k, r] * (real(1.0) + wp.abs(theta[k, r]))
                         + wp.abs(elastic)
                     )
@@ -227,11 +227,11 @@ def check_kernel(kind: RodKind, real, linear):
             if flags[ITERATION, r] == 0:
                 continue
             change = real(0.0)
-            noise = real(0.5) * size * reach
+            rounding_error = real(0.5) * size * magnitude
             if wp.static(closed) or k < n - 1:
                 new = energy[1 - accepted, k, r]
                 change = new - energy[accepted, k, r]
-                noise += wp.abs(new)
+                rounding_error += wp.abs(new)
             # energy change of inertia and loads along the step, from products of small differences
             u = V()
             if moved:
@@ -253,6 +253,6 @@ def check_kernel(kind: RodKind, real, linear):
                 if loaded != 0:
                     work -= rotation_step * load_angle[k, r]
             change_out[k, r] = change + work
-            noise_out[k, r] = linear(noise + wp.abs(work))
+            noise_out[k, r] = linear(rounding_error + wp.abs(work))
 
     return check

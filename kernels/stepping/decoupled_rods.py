@@ -289,16 +289,16 @@ def world_kernels(real):
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def hope(
         gap: wp.array(dtype=real),
-        reach: real,
+        search_distance: real,
         overflow: wp.array(dtype=int),
         scalars: wp.array2d(dtype=real),
         status: wp.array2d(dtype=int),
         any_tried: wp.array(dtype=int),
         remaining: wp.array(dtype=int),
     ):
-        """Try worlds with no gap below `reach` [m]; `any_tried` and `remaining` are zero before."""
+        """Try worlds with no gap below `search_distance` [m]; `any_tried` and `remaining` are zero before."""
         w = wp.tid()
-        tried = whole(scalars, w) and gap[w] >= reach and overflow[0] == 0
+        tried = whole(scalars, w) and gap[w] >= search_distance and overflow[0] == 0
         enter(status, w, tried)
         if tried:
             any_tried[0] = 1
@@ -316,7 +316,7 @@ def world_kernels(real):
         searched: int,
         some: wp.array(dtype=int),
         gap: wp.array(dtype=real),
-        reach: real,
+        search_distance: real,
         crossed: wp.array(dtype=int),
         overflow: wp.array(dtype=int),
         rounded: int,
@@ -344,7 +344,7 @@ def world_kernels(real):
         if done and searched == 0 and culling[DOUBT, w] != 0:
             again[0] = 1
             done = False
-        if searched != 0 and (overflow[0] != 0 or (some[0] != 0 and (gap[w] < reach or crossed[w] != 0))):
+        if searched != 0 and (overflow[0] != 0 or (some[0] != 0 and (gap[w] < search_distance or crossed[w] != 0))):
             done = False
         if not done:
             remaining[0] = 1

@@ -32,10 +32,11 @@ ROWS = 4
 
 @cache
 def balance_function(term: Term, real):
-    """Return the device function `balance(q0, s0, q, s, w, p, reach, floor) -> rows` of one element.
+    """Return the device function `balance(q0, s0, q, s, w, p, magnitude, rounding_factor) -> rows` of one element.
 
     Rows: energy drift of the step, its rounding bound, elastic energy at the end, viscous dissipation. `q0`, `q` are the dofs and
-    `s0`, `s` the lagged data at the start and the midpoint. `reach` is the magnitude of positions, `floor` their relative rounding.
+        `s0`, `s` the lagged data at the start and the midpoint. `magnitude` is the magnitude of positions, `rounding_factor` their
+        relative rounding.
     """
     measure, density = term.measure, term.density
     Q, S, E, _ = measure.types(real)
@@ -47,7 +48,7 @@ def balance_function(term: Term, real):
     lagged = density.lagged
 
     @wp.func
-    def balance(q0: Q, s0: S, q: Q, s: S, w: real, p: P, reach: real, floor: real):
+    def balance(q0: Q, s0: S, q: Q, s: S, w: real, p: P, magnitude: real, rounding_factor: real):
         elastic = p
         if wp.static(lagged):
             elastic[wp.static(size - 1)] = real(0.0)  # without a rate there are no viscous stresses
@@ -61,7 +62,7 @@ def balance_function(term: Term, real):
         if wp.static(lagged):
             taken = w * wp.dot(slope_of(middle, p) - slope, strain)
         force = wp.max(wp.abs((slope * w) * jacobian))
-        rounding = floor * (wp.abs(start) + wp.abs(end) + force * reach)
+        rounding = rounding_factor * (wp.abs(start) + wp.abs(end) + force * magnitude)
         # a magnet's energy may be negative: its magnitude counts
         return B(end - start - w * wp.dot(slope, strain), rounding, wp.abs(end), taken)
 
@@ -89,18 +90,22 @@ def rows_function(storage: ElementStorage, index: int, real):
         window: W,
         lagged: L,
         whole: bool,
-        reach: real,
-        floor: real,
+        magnitude: real,
+        rounding_factor: real,
         island: int,
         e: int,
         column: int,
     ):
         rows = B()
         if wp.static(index > 0):
-            rows += before(inputs, window0, lagged0, window, lagged, whole, reach, floor, island, e, column)
+            rows += before(
+                inputs, window0, lagged0, window, lagged, whole, magnitude, rounding_factor, island, e, column
+            )
         if whole or wp.static(everywhere):
             w, p = parameters(inputs, island, e, column)
-            rows += balance(local(window0), short(lagged0), local(window), short(lagged), w, p, reach, floor)
+            rows += balance(
+                local(window0), short(lagged0), local(window), short(lagged), w, p, magnitude, rounding_factor
+            )
         return rows
 
     return rows_at
@@ -124,7 +129,7 @@ def element_kernel(storage: ElementStorage, real, linear):
         middle: Inputs,
         stiffness: wp.array(dtype=linear),
         scalars: wp.array2d(dtype=real),
-        floor: real,
+        rounding_factor: real,
         ranges: int,
         rows_out: wp.array3d(dtype=real),
     ):
@@ -138,9 +143,9 @@ def element_kernel(storage: ElementStorage, real, linear):
             whole = whole_of(middle, island, e)
             q0, s0 = read(start, island, e, whole)
             q, s = read(middle, island, e, whole)
-            reach = reach_of(middle, island, e)
-            total += rows_of_all(middle, q0, s0, q, s, whole, reach, floor, island, e, column)
-            least = floor * reach
+            magnitude = reach_of(middle, island, e)
+            total += rows_of_all(middle, q0, s0, q, s, whole, magnitude, rounding_factor, island, e, column)
+            least = rounding_factor * magnitude
             total[wp.static(ROUNDING)] = total[wp.static(ROUNDING)] + real(stiffness[column]) * least * least
         for row in range(wp.static(ROWS)):
             rows_out[row, first, island] = total[row]
@@ -176,7 +181,7 @@ def node_kernel(nodes: NodeStorage, real, drag: bool):
         follows: int,
         scalars: wp.array2d(dtype=real),
         damping: wp.array(dtype=real),
-        floor: real,
+        rounding_factor: real,
         ranges: int,
         rows_out: wp.array3d(dtype=real),
     ):
@@ -205,7 +210,7 @@ def node_kernel(nodes: NodeStorage, real, drag: bool):
                 force = dofs(load, load_angle, k, island)
                 made = wp.dot(dofs(load_solved, load_angle_solved, k, island) - force, moved)
                 worked = wp.abs(wp.dot(force, moved))
-            total += B(real(2.0) * made, real(2.0) * floor * worked, kinetic, damped)
+            total += B(real(2.0) * made, real(2.0) * rounding_factor * worked, kinetic, damped)
         for row in range(wp.static(ROWS)):
             rows_out[row, first, island] = total[row]
 

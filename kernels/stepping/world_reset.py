@@ -48,8 +48,8 @@ def blank_kernels(dtype):
     """Build the kernels of invalid worlds.
 
     `blank`: set entries of an array to nan in masked worlds.
-    `bar`: write the outcome of worlds with an invalid parameter or nan as first entry of an array.
-    `judge`: mark worlds with a non-finite entry.
+    `deactivate`: write the outcome of worlds with an invalid parameter or nan as first entry of an array.
+    `find_non_finite`: mark worlds with a non-finite entry.
     """
     scalar = getattr(dtype, "_wp_scalar_type_", dtype)
 
@@ -60,25 +60,25 @@ def blank_kernels(dtype):
             out[i, j, k] = dtype(scalar(wp.nan))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def bar(
+    def deactivate(
         invalid: wp.array(dtype=int),
         values: wp.array3d(dtype=dtype),
         width: int,
-        resting: wp.array(dtype=int),
+        outcome_codes: wp.array(dtype=int),
     ):
         w = wp.tid()
         code = invalid[w]
         if code == 0 and wp.isnan(values[0, 0, w * width]):
             code = wp.static(outcome.STEP_FAILED)
-        resting[w] = code
+        outcome_codes[w] = code
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def judge(values: wp.array3d(dtype=dtype), width: int, resting: wp.array(dtype=int)):
+    def find_non_finite(values: wp.array3d(dtype=dtype), width: int, outcome_codes: wp.array(dtype=int)):
         i, j, k = wp.tid()
         if not wp.isfinite(values[i, j, k]):
-            resting[k / width] = wp.static(outcome.INVALID_INPUT)
+            outcome_codes[k / width] = wp.static(outcome.INVALID_INPUT)
 
-    return blank, bar, judge
+    return blank, deactivate, find_non_finite
 
 
 @cache
@@ -96,14 +96,14 @@ def island_kernels():
     def note(
         flags: wp.array2d(dtype=int),
         width: int,
-        resting: wp.array(dtype=int),
+        outcome_codes: wp.array(dtype=int),
         failed: wp.array(dtype=int),
         any_failed: wp.array(dtype=int),
     ):
         """Collect the largest outcome of failed islands, in worlds that had not failed before."""
         i = wp.tid()
         w = i / width
-        if flags[STATUS, i] == wp.static(outcome.STEP_FAILED) and resting[w] == 0:
+        if flags[STATUS, i] == wp.static(outcome.STEP_FAILED) and outcome_codes[w] == 0:
             wp.atomic_max(failed, w, flags[FAILURE_STATUS, i])
             any_failed[0] = 1
 
@@ -116,10 +116,10 @@ def island_kernels():
             flags[FAILURE_STATUS, i] = 0
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def enter(failed: wp.array(dtype=int), resting: wp.array(dtype=int)):
+    def enter(failed: wp.array(dtype=int), outcome_codes: wp.array(dtype=int)):
         w = wp.tid()
         if failed[w] != 0:
-            resting[w] = failed[w]
+            outcome_codes[w] = failed[w]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def clear(mask: wp.array(dtype=int), width: int, flags: wp.array2d(dtype=int)):

@@ -195,8 +195,10 @@ class Difference:
             device_arrays.assign(
                 new, np.tile(values, [all_ // one for all_, one in zip(size, values.shape, strict=True)])
             )
-        for name, array in (self.model.coupled.touching if self.model.coupled else {}).items():
-            wide.coupled.touching[name].assign(np.tile(array.numpy(), (len(SIDES),) + (1,) * (array.ndim - 1)))
+        for name, array in (self.model.coupled.contact_parameters if self.model.coupled else {}).items():
+            wide.coupled.contact_parameters[name].assign(
+                np.tile(array.numpy(), (len(SIDES),) + (1,) * (array.ndim - 1))
+            )
         for shift in (shift for shift in shifts if shift.axis is not None):
             shift.write(wide, state, shift.by_worlds(step))
         after, losses = self.advancing(wide)(state), np.zeros(len(SIDES))

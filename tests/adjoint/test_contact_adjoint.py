@@ -43,10 +43,10 @@ def differentiated(name: str, law: str, steps: int, speed: float = 0.0, coeffici
     if coefficients:
         scene.contact_between("bar", "obstacle", friction=coefficients)
     model = built(scene)
-    ranges = model.coupled.touching["range"]
+    ranges = model.coupled.contact_parameters["range"]
     ranges.assign(0.99 * ranges.numpy())  # room to grow, up to the search distance
     state = touching(model, along=speed)
-    model.touch.at(state.coupled.q)
+    model.touch.evaluate(state.coupled.q)
     assert any(part.factor.used.numpy()[: part.count.numpy()[0]].any() for part in model.touch.terms.lists)
     return model, *vjp_of_steps(model, state, DT, steps)
 
@@ -55,7 +55,7 @@ def by_number(inputs: list, name: str) -> np.ndarray:
     """Return derivatives by a contact parameter, symmetrised over the two contact groups."""
     if name == "radius":
         return sum(read[-1].radius.numpy() for read in inputs)
-    gradient = sum(read[-1].touching.numpy()[ROWS[name]] for read in inputs)
+    gradient = sum(read[-1].contact_parameters.numpy()[ROWS[name]] for read in inputs)
     return 0.5 * (gradient + gradient.swapaxes(1, 2))
 
 
@@ -63,11 +63,11 @@ def number_shifts(model, inputs: list, names: tuple) -> list[Shift]:
     """Return a direction in each contact parameter."""
     shifts = []
     for name in names:
-        values, gradient = model.coupled.touching[name].numpy(), by_number(inputs, name)
+        values, gradient = model.coupled.contact_parameters[name].numpy(), by_number(inputs, name)
         assert gradient.any(), name
 
         def write(wide, _state, new, name=name):
-            wide.coupled.touching[name].assign(new)
+            wide.coupled.contact_parameters[name].assign(new)
 
         shifts.append(Shift(f"contact: {name}", values, gradient, along(gradient, values), write, 0))
     return shifts
@@ -131,13 +131,13 @@ def test_gradients_need_the_derivative_by_lagged_quantities(name, friction_itera
         )
         return gradient.coupled.q.numpy(), by_number(inputs, "stiffness")
 
-    exact, chain = gradients(), CoupledLinearSolve.chain
+    exact, chain = gradients(), CoupledLinearSolve.vjp_by_lagged
 
     def broken(solve, by_lagged, grad_q):
         by_lagged.zero_()
         chain(solve, by_lagged, grad_q)
 
-    monkeypatch.setattr(CoupledLinearSolve, "chain", broken)
+    monkeypatch.setattr(CoupledLinearSolve, "vjp_by_lagged", broken)
     for right, wrong in zip(exact, gradients(), strict=True):
         assert np.abs(right - wrong).max() > 0.1 * np.abs(right).max()
 
@@ -238,13 +238,13 @@ def test_unconverged_adjoint_solves_are_refused(friction_iterations, monkeypatch
     model = built(scene_of("crossing rods", friction_iterations=friction_iterations, **WITH_FRICTION))
     adjoint = Adjoint(ddg.Integrator(model))
     after, tape = adjoint.step(touching(model), DT)
-    system, missed, chain = adjoint.coupled.solve.system, ExactSystem.missed, CoupledLinearSolve.chain
+    system, missed, chain = adjoint.coupled.solve.system, ExactSystem.missed, CoupledLinearSolve.vjp_by_lagged
 
     def go_on(*arguments):
         system.missed = missed
         chain(*arguments)
 
-    monkeypatch.setattr(CoupledLinearSolve, "chain", go_on)
+    monkeypatch.setattr(CoupledLinearSolve, "vjp_by_lagged", go_on)
     system.missed = 0.0  # which no solution leaves
     with pytest.raises(
         SolverError, match=r"contact: conjugate gradients have not solved .* no gradient goes through it"

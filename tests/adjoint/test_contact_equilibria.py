@@ -61,7 +61,7 @@ def pressed_model(name: str, law: str, coefficients=None, **contact):
     if coefficients:
         scene.contact_between("bar", "obstacle", friction=coefficients)
     model = built(scene)
-    ranges = model.coupled.touching["range"]
+    ranges = model.coupled.contact_parameters["range"]
     ranges.assign(0.99 * ranges.numpy())  # room to grow, up to the search distance
     return model
 

@@ -85,8 +85,8 @@ def point_triangle(p, a, b, c) -> np.ndarray:
 
 def admissible_pairs(shapes: CollisionMesh, first: int, second: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices (n,), (n,) of pairs of primitives that are not excluded, by numbers of nodes."""
-    nodes_a, _, owner_a, span_a = shapes.things(first)
-    nodes_b, _, owner_b, _ = shapes.things(second)
+    nodes_a, _, owner_a, span_a = shapes.primitives(first)
+    nodes_b, _, owner_b, _ = shapes.primitives(second)
     fits = ~(nodes_a[:, None, :, None] == nodes_b[None, :, None, :]).any((2, 3))
     lower, upper = np.minimum(owner_a[:, None], owner_b), np.maximum(owner_a[:, None], owner_b)
     fits &= ~np.isin(lower * len(shapes.names) + upper, shapes.ignored)
@@ -106,25 +106,27 @@ def admissible_pairs(shapes: CollisionMesh, first: int, second: int) -> tuple[np
 
 def distances(shapes: CollisionMesh, x: np.ndarray, first: int, second: int, i, j) -> tuple[np.ndarray, np.ndarray]:
     """Return the distances and thicknesses (n,) of pairs."""
-    nodes_a, radius_a, *_ = shapes.things(first)
-    nodes_b, radius_b, *_ = shapes.things(second)
+    nodes_a, radius_a, *_ = shapes.primitives(first)
+    nodes_b, radius_b, *_ = shapes.primitives(second)
     corners = [*np.moveaxis(x[nodes_a[i]], 1, 0), *np.moveaxis(x[nodes_b[j]], 1, 0)]
     if second == BALLS:
         return point_edge(corners[2], *corners[:2]), radius_a[i] + radius_b[j]
     return (edge_edge if first == 2 else point_triangle)(*corners), radius_a[i] + radius_b[j]
 
 
-def near_pairs(shapes: CollisionMesh, x: np.ndarray, first: int, second: int, reach: float) -> set[tuple[int, int]]:
-    """Return the pairs with a gap of at most `reach`."""
+def near_pairs(
+    shapes: CollisionMesh, x: np.ndarray, first: int, second: int, search_distance: float
+) -> set[tuple[int, int]]:
+    """Return the pairs with a gap of at most `search_distance`."""
     i, j = admissible_pairs(shapes, first, second)
     balls = []
     for size in (first, second):
-        nodes, radius, *_ = shapes.things(size)
+        nodes, radius, *_ = shapes.primitives(size)
         middle = x[nodes].mean(1)
         balls.append((middle, np.linalg.norm(x[nodes] - middle[:, None], axis=2).max(1) + radius))
     (centre_a, extent_a), (centre_b, extent_b) = balls
-    hit = np.linalg.norm(centre_a[i] - centre_b[j], axis=1) <= extent_a[i] + extent_b[j] + reach
+    hit = np.linalg.norm(centre_a[i] - centre_b[j], axis=1) <= extent_a[i] + extent_b[j] + search_distance
     i, j = i[hit], j[hit]
     d, thickness = distances(shapes, x, first, second, i, j)
-    close = d - thickness <= reach
+    close = d - thickness <= search_distance
     return set(zip(i[close].tolist(), j[close].tolist(), strict=True))

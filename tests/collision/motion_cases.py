@@ -15,7 +15,7 @@ def tangle(seed: int, spread: float = 0.6) -> tuple[CollisionMesh, np.ndarray]:
     shapes, points = scene(seed, spread, rods=30, triangles=60)
     for first, second in SIDES:
         i, j = np.array(sorted(near_pairs(shapes, points, first, second, 0.0)), int).reshape(-1, 2).T
-        owners = shapes.things(first)[2][i], shapes.things(second)[2][j]
+        owners = shapes.primitives(first)[2][i], shapes.primitives(second)[2][j]
         for a, b in set(zip(*map(np.ndarray.tolist, owners), strict=True)):
             shapes.ignore(a, b)
     return shapes, points
@@ -28,11 +28,11 @@ def ccd_bodies(shapes: CollisionMesh, kind: str) -> tuple[np.ndarray, int]:
         return np.arange(n), n
     if kind == "world":
         return np.zeros(n, int), 1
-    unit = np.full(n, -1)
+    ccd_body = np.full(n, -1)
     for size in shapes.sizes:
-        nodes, _, owner, _ = shapes.things(size)
-        unit[nodes] = owner[:, None]
-    return unit, len(shapes.names)
+        nodes, _, owner, _ = shapes.primitives(size)
+        ccd_body[nodes] = owner[:, None]
+    return ccd_body, len(shapes.names)
 
 
 class Motion:
@@ -48,21 +48,23 @@ class Motion:
         together=(),
         dtype=wp.vec3d,
     ):
-        unit, self.units = ccd_bodies(shapes, kind)
+        ccd_body, self.num_ccd_bodies = ccd_bodies(shapes, kind)
         self.base, self.q = (upload(points, device, dtype) for _ in range(2))
-        self.search = BroadPhase(shapes, self.base, worlds, reach=REACH, margin=MARGIN)
-        self.unit = wp.array(unit, dtype=int, device=device)
+        self.search = BroadPhase(shapes, self.base, worlds, search_distance=REACH, margin=MARGIN)
+        self.ccd_body = wp.array(ccd_body, dtype=int, device=device)
         self.together = wp.array([int(w in together) for w in range(worlds)], dtype=int, device=device)
 
-    def launch(self, keep: float = 1.0) -> None:
-        self.search.filter(self.base, self.q, self.unit, self.together, self.units, keep)
+    def launch(self, min_separation_fraction: float = 1.0) -> None:
+        self.search.filter(
+            self.base, self.q, self.ccd_body, self.together, self.num_ccd_bodies, min_separation_fraction
+        )
 
-    def __call__(self, move: np.ndarray, keep: float = 1.0) -> np.ndarray:
+    def __call__(self, move: np.ndarray, min_separation_fraction: float = 1.0) -> np.ndarray:
         """Return the positions (worlds times nodes, 3) to which a displacement is limited."""
         base = self.base.numpy()
         while True:
             self.q.assign(base + move)
-            self.launch(keep)
+            self.launch(min_separation_fraction)
             if not self.search.fit(self.base):
                 return self.q.numpy().copy()
 

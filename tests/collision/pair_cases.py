@@ -57,7 +57,7 @@ def terms(
     """Return contact terms evaluated at x, and x on the device."""
     density, parameters = LAWS[law]
     positions = upload(x, device)
-    search = BroadPhase(shapes, positions, worlds, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, positions, worlds, search_distance=REACH, margin=MARGIN)
     result = ContactPotential(search, density, **{**parameters, **options})
     result.evaluate(positions)
     return result, positions
@@ -127,7 +127,7 @@ def psi(law: str, gap: np.ndarray, order: int = 0) -> np.ndarray:
 
 def end_distances(shapes: CollisionMesh, rest: np.ndarray, x: np.ndarray, i, j):
     """Return distances and weights (2, 3, n) of the ends of edges i from edges j and both nodes of these."""
-    nodes, _, owner, span = shapes.things(2)
+    nodes, _, owner, span = shapes.primitives(2)
     key = owner[:, None] * len(rest) + nodes
     inside = (key[:, :, None] == np.concatenate([key[:, 0], key[:, 1]])).sum(2) > 1
     p, a, b = x[nodes[i]].swapaxes(0, 1), x[nodes[j, 0]], x[nodes[j, 1]]
@@ -143,7 +143,7 @@ def brute_force_energy(shapes: CollisionMesh, x: np.ndarray, law: str, v: np.nda
     """
     rest, k = shapes.points, LAWS[law][1]["stiffness"]
     i, j = admissible_pairs(shapes, 2, 2)
-    nodes, radius, *_ = shapes.things(2)
+    nodes, radius, *_ = shapes.primitives(2)
     order = 0 if v is None else 2
 
     def corners(x):
@@ -171,7 +171,7 @@ def brute_force_energy(shapes: CollisionMesh, x: np.ndarray, law: str, v: np.nda
         ).sum()
     if 3 in shapes.sizes:
         i, j = admissible_pairs(shapes, 1, 3)
-        (point, thin, *_), (sides, thick, *_) = shapes.things(1), shapes.things(3)
+        (point, thin, *_), (sides, thick, *_) = shapes.primitives(1), shapes.primitives(3)
 
         def separation(x):
             return point_triangle(x[point[i, 0]], *(x[sides[j, k]] for k in range(3)))

@@ -37,8 +37,8 @@ def gaps(shapes: CollisionMesh, name: str, x: np.ndarray) -> np.ndarray:
     result = []
     for side in [SIDES["edges"]] + [SIDES["point and triangle"]] * (name != "edges"):
         for i, j in zip(*brute_force.admissible_pairs(shapes, *side), strict=True):
-            nodes_a, radius_a, *_ = shapes.things(side[0])
-            nodes_b, radius_b, *_ = shapes.things(side[1])
+            nodes_a, radius_a, *_ = shapes.primitives(side[0])
+            nodes_b, radius_b, *_ = shapes.primitives(side[1])
             corners = [*np.moveaxis(x[:, nodes_a[i]], 1, 0), *np.moveaxis(x[:, nodes_b[j]], 1, 0)]
             d = (brute_force.edge_edge if side[0] == 2 else brute_force.point_triangle)(*corners)
             result.append(d - radius_a[i] - radius_b[j])
@@ -48,7 +48,7 @@ def gaps(shapes: CollisionMesh, name: str, x: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("name", SIDES)
 def test_time_of_impact_is_conservative_and_tight(device, name):
     shapes, x, move = random_pairs(name, 1, 500)
-    search = BroadPhase(shapes, upload(x.reshape(-1, 3), device), len(x), reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, upload(x.reshape(-1, 3), device), len(x), search_distance=REACH, margin=MARGIN)
     search.impact(upload(x.reshape(-1, 3), device), upload(move.reshape(-1, 3), device))
     time = search.time.numpy()
     gap = np.array([gaps(shapes, name, x + t * move) for t in np.linspace(0.0, 1.0, FRAMES)])
@@ -75,10 +75,10 @@ def test_head_on_impact_matches_its_closed_form(device):
     shapes.rod([0, 1], 0.1)
     shapes.rod([2, 3], 0.1)
     x = upload(points, device)
-    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, x, search_distance=REACH, margin=MARGIN)
     search.impact(x, upload(move, device))
     assert search.time.numpy()[0] == pytest.approx(0.36, rel=1e-12)
-    search.impact(x, upload(move, device), keep=0.0)
+    search.impact(x, upload(move, device), min_separation_fraction=0.0)
     assert search.time.numpy()[0] == pytest.approx(0.45, rel=1e-12)
     search.impact(x, upload(0.35 * move, device))
     assert search.time.numpy()[0] == 1.0
@@ -103,7 +103,7 @@ def test_crossings_are_counted_exactly(device, offset):
     for k in range(16):
         shapes.rod([2 * k, 2 * k + 1], 0.01)
     x = upload(points, device)
-    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, x, search_distance=REACH, margin=MARGIN)
     for fall, crossed in ((0.2999, 0), (0.3001, 64), (0.6, 64), (5.0, 64)):
         move = np.zeros_like(points)
         move[16:, 2] = -fall
@@ -128,7 +128,7 @@ def test_close_sliding_is_no_crossing(device, distance):
     shapes.rod([0, 1], 1e-5)
     shapes.rod([2, 3], 1e-5)
     x = upload(points, device)
-    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, x, search_distance=REACH, margin=MARGIN)
     for direction in ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]):
         search.crossings(x, upload(np.outer([0, 0, 1, 1], direction), device))
         assert search.crossed.numpy()[0] == (distance == 0.0)
@@ -141,7 +141,7 @@ def test_crossings_are_found_without_a_new_search(device):
     shapes.rod([0, 1], 1e-4)
     shapes.rod([2, 3], 1e-4)
     x = upload(points, device)
-    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, x, search_distance=REACH, margin=MARGIN)
     searches = search.searches.numpy()[0]
     for fall in (2.9e-3, 3.1e-3, 4.9e-3, 5.1e-3, 2.0):
         search.check_crossings(x, upload(points - np.outer([0, 0, 1, 1], [0.0, 0.0, fall]), device))
@@ -158,7 +158,7 @@ def test_crossings_equal_roots_of_signed_volumes(device):
     shapes = CollisionMesh(x[0])
     shapes.rod([0, 1], 0.01)
     shapes.rod([2, 3], 0.01)
-    search = BroadPhase(shapes, upload(x.reshape(-1, 3), device), n, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, upload(x.reshape(-1, 3), device), n, search_distance=REACH, margin=MARGIN)
     search.crossings(upload(x.reshape(-1, 3), device), upload(move.reshape(-1, 3), device))
     times = np.linspace(0.0, 1.0, 4)
 

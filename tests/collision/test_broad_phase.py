@@ -28,7 +28,7 @@ def assert_complete(search: BroadPhase, x: np.ndarray, sides=SIDES) -> None:
 @covering(1, dtype=(wp.vec3d, wp.vec3f), spread=(0.3, 1.0, 3.0))
 def test_candidates_equal_those_of_all_pairs(device, spread, dtype):
     shapes, points = scene(1, spread)
-    search = BroadPhase(shapes, upload(points, device, dtype), reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, upload(points, device, dtype), search_distance=REACH, margin=MARGIN)
     assert_complete(search, points.astype(np.float32) if dtype is wp.vec3f else points)
     assert all(len(candidates) > 10 for candidates in candidate_pairs(search)) or spread > 1.0
 
@@ -36,10 +36,10 @@ def test_candidates_equal_those_of_all_pairs(device, spread, dtype):
 def test_ignored_objects_form_no_pairs(device):
     shapes, points = scene(2, 0.3)
     x = upload(points, device)
-    before = candidate_pairs(BroadPhase(shapes, x, reach=REACH, margin=MARGIN))
+    before = candidate_pairs(BroadPhase(shapes, x, search_distance=REACH, margin=MARGIN))
     for pair in ((0, 1), (7, 3), (5, 5), (50, 51), (2, 52), (54, 54)):
         shapes.ignore(*pair)
-    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, x, search_distance=REACH, margin=MARGIN)
     assert_complete(search, points)
     assert all(len(after) < len(all_of) for after, all_of in zip(candidate_pairs(search), before, strict=True))
 
@@ -54,7 +54,7 @@ def test_edges_within_the_exclusion_distance_form_no_pairs(device, closed, exclu
     points = radius * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(n)])
     shapes = CollisionMesh(points)
     shapes.rod(np.arange(n), 0.01, closed=closed, exclusion_length=exclusion)
-    (candidates,) = candidate_pairs(BroadPhase(shapes, upload(points, device), reach=1.0, margin=1.0))
+    (candidates,) = candidate_pairs(BroadPhase(shapes, upload(points, device), search_distance=1.0, margin=1.0))
     i, j = np.triu_indices(n if closed else n - 1, 1)
     steps = np.minimum(j - i, n - (j - i)) if closed else j - i
     wanted = (steps > 1) & (0.1 * (steps - 1) >= exclusion)
@@ -69,7 +69,7 @@ def test_leaf_size_changes_no_pair_and_no_crossing(device, monkeypatch, leaf_siz
     results = []
     for bundle in (bvh.BUNDLE, (leaf_size, leaf_size)):
         monkeypatch.setattr(bvh, "BUNDLE", bundle)
-        search = BroadPhase(shapes, upload(np.tile(points, (2, 1)), device), 2, reach=REACH, margin=MARGIN)
+        search = BroadPhase(shapes, upload(np.tile(points, (2, 1)), device), 2, search_distance=REACH, margin=MARGIN)
         x = upload(np.tile(points, (2, 1)), device)
         lists = [pairs.tolist() for pairs in candidate_pairs(search)]
         search.crossings(x, upload(move, device))
@@ -83,11 +83,11 @@ def test_worlds_form_no_pairs_with_each_other(device):
     shapes, points = scene(3, 0.3, rods=10, triangles=40)
     rng = np.random.default_rng(4)
     worlds = [points + 0.01 * rng.normal(size=points.shape) for _ in range(3)]
-    together = BroadPhase(shapes, upload(np.concatenate(worlds), device), 3, reach=REACH, margin=MARGIN)
+    together = BroadPhase(shapes, upload(np.concatenate(worlds), device), 3, search_distance=REACH, margin=MARGIN)
     for k, candidates in enumerate(candidate_pairs(together)):
         pairs, expected = together.lists[k], []
         for w, x in enumerate(worlds):
-            alone = candidate_pairs(BroadPhase(shapes, upload(x, device), reach=REACH, margin=MARGIN))[k]
+            alone = candidate_pairs(BroadPhase(shapes, upload(x, device), search_distance=REACH, margin=MARGIN))[k]
             expected.append(alone + w * np.array([pairs.first.count, pairs.second.count]))
         assert candidates.tolist() == np.concatenate(expected).tolist()
         assert min(map(len, expected)) > 5
@@ -103,7 +103,7 @@ def test_coincident_and_parallel_edges_are_found(device):
     shapes = CollisionMesh(points)
     for k in range(80):
         shapes.rod([2 * k, 2 * k + 1], 0.003)
-    search = BroadPhase(shapes, upload(points, device), reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, upload(points, device), search_distance=REACH, margin=MARGIN)
     assert_complete(search, points, SIDES[:1])
     assert search.lists[0].count.numpy()[0] == 60 * 59 // 2 + 19 + 18
 
@@ -113,7 +113,7 @@ def test_overflowing_lists_are_empty_until_they_grow(device, room):
     """The capacity is too small for pairs, for overlapping boxes, or for both."""
     shapes, points = scene(5, 0.3)
     x = upload(points, device)
-    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, x, search_distance=REACH, margin=MARGIN)
     whole = candidate_pairs(search)
     for pairs in search.lists:
         pairs.reserve(*room)
@@ -136,7 +136,7 @@ def test_nearly_full_lists_grow_with_overflowing_ones(device):
     """Graphs are then captured again once, not per list. Each list gets room for twice the pairs found."""
     shapes, points = scene(5, 0.3)
     x = upload(points, device)
-    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, x, search_distance=REACH, margin=MARGIN)
     short, full, *_ = sorted(search.lists, key=lambda pairs: -pairs.count.numpy()[0])
     counts = [int(pairs.count.numpy()[0]) for pairs in (short, full)]
     assert min(counts) > 10
@@ -149,14 +149,14 @@ def test_nearly_full_lists_grow_with_overflowing_ones(device):
 
 @pytest.mark.parametrize("excess", [-1e-6, 1e-6])
 def test_candidates_are_valid_for_half_the_margin(device, excess):
-    """Two edges approach from just beyond the search distance; the pair is found before the gap can fall below `reach`."""
+    """Two edges approach from just beyond the search distance; the pair is found before the gap can fall below `search_distance`."""
     gap = REACH + 1.002 * MARGIN
     distance = 0.02 + gap
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, -0.5, distance], [0.5, 0.5, distance]])
     shapes = CollisionMesh(points)
     shapes.rod([0, 1], 0.01)
     shapes.rod([2, 3], 0.01)
-    search = BroadPhase(shapes, upload(points, device), reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, upload(points, device), search_distance=REACH, margin=MARGIN)
     assert not len(candidate_pairs(search)[0])
     searches = search.searches.numpy()[0]
     moved = points.copy()
@@ -174,7 +174,7 @@ def test_dofs_of_no_primitive_trigger_no_search(device):
     points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     shapes = CollisionMesh(points)
     shapes.rod([0, 1], 0.01)
-    search = BroadPhase(shapes, upload(np.tile(points, (2, 1)), device), 2, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, upload(np.tile(points, (2, 1)), device), 2, search_distance=REACH, margin=MARGIN)
     for node, more in ((2, 0), (5, 0), (1, 1), (4, 1)):
         searches, x = search.searches.numpy()[0], np.tile(points, (2, 1))
         x[node, 0] += 2.0 * MARGIN
@@ -186,7 +186,7 @@ def test_dofs_of_no_primitive_trigger_no_search(device):
 def test_captured_update_searches_only_where_needed(device):
     shapes, points = scene(6, 0.5, rods=20, triangles=60)
     x = upload(points, device)
-    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, x, search_distance=REACH, margin=MARGIN)
     device_arrays.load_kernels(search.kernels, device)
     with wp.ScopedCapture(device=device) as capture:
         search.update(x)
@@ -213,14 +213,14 @@ def test_captured_motion_equals_uncaptured(device):
     shapes, points = scene(13, 0.5, rods=20, triangles=60)
     rng = np.random.default_rng(14)
     x, move = upload(points, device), upload(0.02 * rng.normal(size=points.shape), device)
-    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, x, search_distance=REACH, margin=MARGIN)
     device_arrays.load_kernels([*search.kernels, *search._impacts], device)
 
     def step():
         search.rebuild(x)
         search.update(x)
         search.measure(x)
-        search.impact(x, move, keep=0.5)
+        search.impact(x, move, min_separation_fraction=0.5)
         search.crossings(x, move)
 
     def results() -> list[bytes]:
@@ -254,13 +254,13 @@ def test_boxes_contain_their_primitives(device, offset):
     x = upload(points, device)
     lost = wp.zeros(1, dtype=int, device=device)
     for size in shapes.sizes:
-        nodes, radius, *_ = shapes.things(size)
+        nodes, radius, *_ = shapes.primitives(size)
         radii = wp.array([shapes.radii], dtype=wp.float64, device=device)
         primitives = bvh.Primitives(shapes, size, 1, wp.float64, wp.get_device(device), radii)
         primitives.enclose(x, wp.zeros_like(x), wp.zeros(1, dtype=wp.vec3d, device=device), 1.0, 0.002, lost)
-        reach = (radius + 0.002)[:, None]
-        below = points[nodes].min(1) - reach - primitives.lower.numpy().astype(float)
-        above = primitives.upper.numpy().astype(float) - points[nodes].max(1) - reach
+        search_distance = (radius + 0.002)[:, None]
+        below = points[nodes].min(1) - search_distance - primitives.lower.numpy().astype(float)
+        above = primitives.upper.numpy().astype(float) - points[nodes].max(1) - search_distance
         assert min(below.min(), above.min()) > 0.0
         assert max(below.max(), above.max()) <= 5e-7 * (2.0 + offset)
 
@@ -271,9 +271,9 @@ def test_runs_agree_bitwise(device):
     move = upload(0.01 * np.random.default_rng(9).normal(size=points.shape), device)
 
     def run() -> list[bytes]:
-        search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+        search = BroadPhase(shapes, x, search_distance=REACH, margin=MARGIN)
         search.measure(x)
-        search.impact(x, move, keep=0.0)
+        search.impact(x, move, min_separation_fraction=0.0)
         search.crossings(x, move)
         numbers = (search.gap, search.time, search.crossed)
         return [part.tobytes() for part in (*candidate_pairs(search), *(array.numpy() for array in numbers))]
@@ -294,10 +294,10 @@ def test_order_of_objects_is_irrelevant(device):
                 shapes.shell(triangles, 0.004)
             else:
                 shapes.rod(np.array(rods[k]), 0.004)
-        search = BroadPhase(shapes, upload(points, device), reach=REACH, margin=MARGIN)
+        search = BroadPhase(shapes, upload(points, device), search_distance=REACH, margin=MARGIN)
         result = set()
         for pairs, candidates in zip(search.lists, candidate_pairs(search), strict=True):
-            nodes = [shapes.things(side.size)[0] for side in (pairs.first, pairs.second)]
+            nodes = [shapes.primitives(side.size)[0] for side in (pairs.first, pairs.second)]
             result |= {
                 frozenset((tuple(sorted(nodes[0][i])), tuple(sorted(nodes[1][j])))) for i, j in candidates.tolist()
             }
@@ -311,7 +311,7 @@ def test_order_of_objects_is_irrelevant(device):
 def test_non_finite_positions_are_refused_by_name(device):
     shapes, points = scene(12, 1.0, rods=4, triangles=4)
     x = upload(np.concatenate([points, points]), device)
-    search = BroadPhase(shapes, x, 2, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, x, 2, search_distance=REACH, margin=MARGIN)
     broken = np.concatenate([points, points])
     broken[len(points) + 17, 1] = np.nan
     x.assign(broken)
@@ -323,7 +323,8 @@ def test_non_finite_positions_are_refused_by_name(device):
     search.check()
     after = [candidates.tolist() for candidates in candidate_pairs(search)]
     assert after == [
-        candidates.tolist() for candidates in candidate_pairs(BroadPhase(shapes, x, 2, reach=REACH, margin=MARGIN))
+        candidates.tolist()
+        for candidates in candidate_pairs(BroadPhase(shapes, x, 2, search_distance=REACH, margin=MARGIN))
     ]
 
 
@@ -351,9 +352,18 @@ POINTS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0,
             "rod 0 spins: only obstacles spin, given by 4 nodes",
         ),
         (lambda s: s.spin(s.ball(0, 0.1, still=True), [0, 1, 3, 4]), "ball 0 spins: markers are at right angles about"),
-        (lambda s: BroadPhase(s, wp.zeros(5, dtype=wp.vec3d, device="cpu"), reach=1.0, margin=1.0), "no objects"),
-        (lambda s: BroadPhase(s, wp.zeros(4, dtype=wp.vec3d, device="cpu"), reach=1.0, margin=1.0), "5 vectors of 3"),
-        (lambda s: BroadPhase(s, wp.zeros(5, dtype=wp.vec3d, device="cpu"), reach=0.0, margin=1.0), "reach = 0.0"),
+        (
+            lambda s: BroadPhase(s, wp.zeros(5, dtype=wp.vec3d, device="cpu"), search_distance=1.0, margin=1.0),
+            "no objects",
+        ),
+        (
+            lambda s: BroadPhase(s, wp.zeros(4, dtype=wp.vec3d, device="cpu"), search_distance=1.0, margin=1.0),
+            "5 vectors of 3",
+        ),
+        (
+            lambda s: BroadPhase(s, wp.zeros(5, dtype=wp.vec3d, device="cpu"), search_distance=0.0, margin=1.0),
+            "reach = 0.0",
+        ),
     ],
 )
 def test_invalid_shapes_are_refused_by_name(describe, message):

@@ -20,7 +20,7 @@ def random_offsets(rng, count: int, most: float) -> np.ndarray:
 
 def search_motion(shapes: CollisionMesh, x: wp.array, move: wp.array, together: int = 0) -> BroadPhase:
     """Return a search for a motion, with room for all pairs."""
-    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, x, search_distance=REACH, margin=MARGIN)
     flag = wp.full(1, together, dtype=int, device=x.device)
     search.search(x, move, flag)
     if search.fit(x):
@@ -48,7 +48,7 @@ def test_cut_motion_continues_without_a_new_search(device, kind, dtype):
     positions = motion(move).astype(float)
     assert (motion.search.shares.numpy() < 1.0).sum() > 3
     first = motion.search.searches.numpy()[0]
-    alone = candidate_pairs(BroadPhase(shapes, upload(positions, device, dtype), reach=REACH, margin=MARGIN))
+    alone = candidate_pairs(BroadPhase(shapes, upload(positions, device, dtype), search_distance=REACH, margin=MARGIN))
     for fraction in (0.05, 0.1, 0.2, 0.5, 1.0):
         motion.base.assign(positions)
         positions = motion(fraction * (points + move - positions)).astype(float)
@@ -164,7 +164,7 @@ def test_search_serves_the_next_motion(device, dtype):
     rng = np.random.default_rng(32)
     speed = 2.0 * MARGIN * rng.normal(size=points.shape)
     for together, expected in ((0, [1, 0, 1, 0]), (1, [1, 1, 1, 1])):
-        search = BroadPhase(shapes, upload(points, device, dtype), reach=REACH, margin=MARGIN)
+        search = BroadPhase(shapes, upload(points, device, dtype), search_distance=REACH, margin=MARGIN)
         flag, counts, count = wp.full(1, together, dtype=int, device=device), [], 0
         for step in range(4):
             base, q = points + step * speed, points + (step + 1) * speed

@@ -22,7 +22,7 @@ WALL, COLUMN = 0.02, 1e-3  # m, between the axis of a column and walls, and its 
 LAWS = ("barrier", "penalty")
 
 
-def truss(device, law: str, stop: float, reach: float, stiffness: float):
+def truss(device, law: str, stop: float, search_distance: float, stiffness: float):
     """Return the continuation of a truss, pressed down by the load parameter onto a ball at height `stop`.
 
     Two bars with EA = 1 run from (-1, 0, 0) and (1, 0, 0) to an apex.
@@ -35,7 +35,7 @@ def truss(device, law: str, stop: float, reach: float, stiffness: float):
     scene.fix(bars, [1], components="y")
     scene.add_force(bars, 1, (0.0, 0.0, -1.0))
     scene.add_obstacle(ddg.Sphere((0.0, 0.0, stop - THICK - BALL), BALL), name="ball")
-    scene.contact(law=law, range=reach, stiffness=stiffness)
+    scene.contact(law=law, range=search_distance, stiffness=stiffness)
     watch = {"drop": Displacement.of(1, "z", -1.0)}
     return Continuation(scene.build(device, "float64"), watch, load_scale=0.3, floor_factor=1.0)
 
@@ -57,8 +57,8 @@ def upward_force(model, state) -> float:
 @chosen([("barrier", (1e-2, 10.0))], law=LAWS, contact=((1e-2, 10.0), (1e-4, 1e3), (1e-6, 1e5)))
 def test_truss_snaps_onto_a_stop(device, law, contact):
     """The load falls until bars and ball are in contact, then grows with the force of the ball. The way back is the same."""
-    stop, (reach, stiffness) = -0.1, contact
-    follower = truss(device, law, stop, reach, stiffness)
+    stop, (search_distance, stiffness) = -0.1, contact
+    follower = truss(device, law, stop, search_distance, stiffness)
     path = follower.trace(stop=StopCriterion(load=(-1.0, 0.3)))
     assert path.outcome == "load"
     for point in path.points:
@@ -67,8 +67,10 @@ def test_truss_snaps_onto_a_stop(device, law, contact):
     highest = truss_load(np.sqrt(LENGTH ** (2.0 / 3.0) - 1.0))
     first, corner = path.limit_points
     assert first.load == pytest.approx(highest, rel=1e-9)
-    assert corner.load == pytest.approx(truss_load(stop), abs=0.2 * reach + 1e-5)  # within the range, by the slope
-    assert HEIGHT - path.values("drop")[-1] == pytest.approx(stop, abs=reach)
+    assert corner.load == pytest.approx(
+        truss_load(stop), abs=0.2 * search_distance + 1e-5
+    )  # within the range, by the slope
+    assert HEIGHT - path.values("drop")[-1] == pytest.approx(stop, abs=search_distance)
     assert set(path.negative[path.arclength > corner.arclength]) == {0}
     assert set(path.negative[(path.arclength > first.arclength) & (path.arclength < corner.arclength)]) == {1}
     back = follower.trace(path.points[-1].state, start=0.3, direction=-1, stop=StopCriterion(load=(-0.1, 1.0)))

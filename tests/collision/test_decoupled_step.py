@@ -43,7 +43,7 @@ def run(device, scene, steps: int, dt: float = DT, velocities=None, worlds: int 
     decoupled = []
     for _ in range(steps):
         state = integrator.step(state, dt)
-        stepper = integrator._coupled.alone if integrator._coupled else None
+        stepper = integrator._coupled.decoupled if integrator._coupled else None
         decoupled.append(stepper is not None and (stepper.left.numpy() == 0))
     return state, integrator, np.array(decoupled)
 
@@ -69,7 +69,7 @@ def test_falling_rod_is_coupled_only_near_contact(device):
     scene, velocities = falling_rod(speed=0.5)
     options = {"rtol": 1e-10, "dt": 1 / 480, "velocities": velocities}
     actual, integrator, decoupled = run(device, scene, 90, **options)
-    expected, _, _ = run(device, scene, 90, linear="chain", **options)
+    expected, _, _ = run(device, scene, 90, linear="substructuring", **options)
     assert decoupled[0] and decoupled[-1] and not decoupled.all()
     assert integrator.statistics()["contact"]["smallest_gap"] < np.inf
     np.testing.assert_allclose(actual.points(), expected.points(), rtol=0.0, atol=1e-7 * 0.1)
@@ -81,7 +81,7 @@ def test_crossing_within_a_step_is_prevented(device):
     scene, velocities = falling_rod(height=0.02, speed=20.0)
     options = {"dt": 2e-3, "velocities": velocities, "rtol": 1e-10}
     actual, _, decoupled = run(device, scene, 1, **options)
-    expected, _, _ = run(device, scene, 1, linear="chain", **options)
+    expected, _, _ = run(device, scene, 1, linear="substructuring", **options)
     assert not decoupled.any()
     z = actual.points()[:, 2]
     assert z[16] - z[5] > 2.0 * RADIUS
@@ -107,7 +107,7 @@ def test_moving_obstacles_couple_rods_and_follow_their_motion(device):
     scene.add_obstacle(ddg.Plane((0.0, 0.0, -1.0), (0.0, 0.0, 1.0)))
     options = {"rtol": 1e-10, "steps": 40, "dt": 1 / 480}
     actual, _, decoupled = run(device, scene, **options)
-    expected, _, _ = run(device, scene, linear="chain", **options)
+    expected, _, _ = run(device, scene, linear="substructuring", **options)
     assert decoupled[0] and not decoupled.all()
     np.testing.assert_allclose(actual.points(), expected.points(), rtol=0.0, atol=1e-7 * 0.1)
     np.testing.assert_allclose(actual.obstacle_points(), expected.obstacle_points(), rtol=0.0, atol=1e-15)
@@ -171,7 +171,7 @@ def test_grips_move_decoupled_rods(device):
             poses[:, 0, 1], poses[:, 0, 3] = 1e-3 * step * np.array([1.0, -0.5]), 0.02 * step
             state = integrator.step(state, DT, ddg.Controls(poses=poses))
         states.append(state)
-    assert (integrator._coupled.alone.left.numpy() == 0).all()
+    assert (integrator._coupled.decoupled.left.numpy() == 0).all()
     np.testing.assert_allclose(states[1].points(), states[0].points(), rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(states[1].angles(), states[0].angles(), rtol=0.0, atol=1e-10)
 
@@ -185,7 +185,7 @@ def test_resumed_run_repeats_its_steps_bitwise(device):
     for _ in range(24):
         snapshots.append(state.snapshot())
         state = integrator.step(state, DT)
-        is_coupled.append(bool(integrator._coupled.alone.left.numpy()[0]))
+        is_coupled.append(bool(integrator._coupled.decoupled.left.numpy()[0]))
     assert len(set(is_coupled)) == 2
     for start in (3, 6, 12, 20):
         resumed, again = ddg.Integrator(model), model.restore(snapshots[start])
@@ -218,7 +218,7 @@ def approaching_rods(kick: float = 0.0, rods: int = 1, gap: float = 0.15, **cont
 
 
 def bound_updates(integrator) -> int:
-    return int(integrator._coupled.alone.runs.looks.numpy()[0])
+    return int(integrator._coupled.decoupled.runs.looks.numpy()[0])
 
 
 def test_sudden_motion_out_of_old_bounds_is_detected(device):
@@ -226,7 +226,7 @@ def test_sudden_motion_out_of_old_bounds_is_detected(device):
     scene, velocities = approaching_rods(kick=0.01, rods=2)
     options = {"rtol": 1e-10, "dt": 1 / 480, "velocities": velocities}
     actual, integrator, decoupled = run(device, scene, 150, **options)
-    expected, reference, _ = run(device, scene, 150, linear="chain", **options)
+    expected, reference, _ = run(device, scene, 150, linear="substructuring", **options)
     first = int(np.argmin(decoupled[:, 0]))
     assert decoupled[:first].all() and first > 96 and bound_updates(integrator) < 40
     gaps = [each.statistics()["contact"]["smallest_gap"] for each in (integrator, reference)]
@@ -257,7 +257,7 @@ def test_swung_capsule_is_detected(device):
     scene.add_obstacle(ddg.Capsule((0.04, -0.1, -0.15), (0.04, 0.2, -0.15), 0.005), motion=swing, name="bat")
     options = {"rtol": 1e-10, "dt": 1 / 480}
     actual, integrator, decoupled = run(device, scene, 78, **options)
-    expected, _, _ = run(device, scene, 78, linear="chain", **options)
+    expected, _, _ = run(device, scene, 78, linear="substructuring", **options)
     first = int(np.argmin(decoupled[:, 0]))
     assert 60 < first < 78 and bound_updates(integrator) < 24
     np.testing.assert_allclose(actual.points(), expected.points(), rtol=0.0, atol=1e-6 * 0.1)
@@ -276,7 +276,7 @@ def test_reset_within_reach_is_detected(device):
     to[:, 11:, 2] = 2.2 * RADIUS
     state = integrator.reset(state, np.array([True, False]), model.state(points=to, velocities=np.stack([near[1]] * 2)))
     state = integrator.step(state, DT)
-    assert integrator._coupled.alone.left.numpy().tolist() == [1, 0]
+    assert integrator._coupled.decoupled.left.numpy().tolist() == [1, 0]
     assert state.points()[0, 16, 2] - state.points()[0, 5, 2] > 2.0 * RADIUS
     assert 0.0 < integrator.statistics()["contact"]["smallest_gap"] < 1e-3
 
@@ -290,7 +290,7 @@ def test_run_resumed_before_contact_repeats_its_steps_bitwise(device):
     for _ in range(130):
         snapshots.append(state.snapshot())
         state = integrator.step(state, 1 / 480)
-        is_coupled.append(bool(integrator._coupled.alone.left.numpy()[0]))
+        is_coupled.append(bool(integrator._coupled.decoupled.left.numpy()[0]))
         updates.append(bound_updates(integrator))
     assert len(set(is_coupled)) == 2
     left = int(np.flatnonzero(np.diff(updates))[2])
@@ -356,7 +356,7 @@ def closed_rod() -> ddg.Scene:
 
 @pytest.mark.parametrize(
     ("scene", "options"),
-    [(closed_rod, {}), (rods, {"linear": "chain"}), (lambda: rods(contact=False), {})],
+    [(closed_rod, {}), (rods, {"linear": "substructuring"}), (lambda: rods(contact=False), {})],
 )
 def test_decoupling_is_not_built_where_it_does_not_apply(device, scene, options, monkeypatch):
     def refuse(*_):
@@ -371,9 +371,9 @@ def test_steps_with_controls_are_coupled(device):
     model = scene.build(device=device)
     integrator, state = ddg.Integrator(model), model.state()
     state = integrator.step(state, DT)
-    assert integrator._coupled.alone is not None
+    assert integrator._coupled.decoupled is not None
     state = integrator.step(state, DT, ddg.Controls(gravity=(0.0, 0.0, -1.0)))
-    assert integrator._coupled.alone is None
+    assert integrator._coupled.decoupled is None
 
 
 def test_changed_parameters_reach_decoupled_rods(device):
@@ -390,7 +390,7 @@ def test_changed_parameters_reach_decoupled_rods(device):
             model.set_parameter("rod_stretch", "stiffness", stiffness)
         for _ in range(3):
             state = integrator.step(state, DT)
-        assert (integrator._coupled.alone is None) == whole
+        assert (integrator._coupled.decoupled is None) == whole
         points.append(state.points())
     usual, decoupled, is_coupled = points
     np.testing.assert_allclose(decoupled, is_coupled, atol=1e-10)

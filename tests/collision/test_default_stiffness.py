@@ -74,7 +74,7 @@ def test_restart_is_bitwise_equal(device):
 def test_given_stiffness_is_kept(device):
     """Too small a stiffness is refused, and the first remedy named works."""
     model, state = thrown_cloth(0.05, 2.0, device, stiffness=20.0)
-    assert not model.coupled.host.touching.inertia.any()
+    assert not model.coupled.host.contact_parameters.inertia.any()
     assert "net/rate" not in state.arrays()
     integrator = ddg.Integrator(model)
     with pytest.raises(ddg.SolverError, match="give their contact a larger stiffness, 100 times as much") as error:
@@ -108,7 +108,7 @@ def test_default_stiffness_is_scale_invariant(kind, gravity):
             scene.add_shell(points, triangles, thickness=0.01 * length, material=material)
         scene.add_obstacle(ddg.Plane())
         scene.contact()
-        contact = scene.build("cpu").coupled.host.touching
+        contact = scene.build("cpu").coupled.host.contact_parameters
         sizes = young * length, length, density * length**3
         numbers = (values[contact.meeting] for values in (contact.stiffness, contact.range, contact.inertia))
         scaled.append([values / size for values, size in zip(numbers, sizes, strict=True)])

@@ -155,7 +155,7 @@ def test_float32_positions(device, case):
     """Float32 positions resolve a slip of 1 mm to 1e-4."""
     whole, _, x, after = friction_terms(case, device, slip=1e-3, velocity=1.0)
     positions = upload(x, device, wp.vec3f)
-    search = BroadPhase(CASES[case]()[0], positions, reach=REACH, margin=MARGIN)
+    search = BroadPhase(CASES[case]()[0], positions, search_distance=REACH, margin=MARGIN)
     single = ContactPotential(search, smooth_penalty, **LAWS["penalty"][1], friction=MU, velocity=1.0)
     single.lag(positions)
     single.law.stiffness.zero_()

@@ -29,9 +29,9 @@ def test_candidates_do_not_depend_on_the_thread_mapping(device, many, worlds):
     shapes, points = scene(1, 0.3)
     rng = np.random.default_rng(1)
     x = upload(np.concatenate([points + 1e-3 * rng.normal(size=points.shape) for _ in range(worlds)]), device)
-    one = candidate_pairs(BroadPhase(shapes, x, worlds, reach=REACH, margin=MARGIN))
+    one = candidate_pairs(BroadPhase(shapes, x, worlds, search_distance=REACH, margin=MARGIN))
     many()
-    search = BroadPhase(shapes, x, worlds, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, x, worlds, search_distance=REACH, margin=MARGIN)
     assert max(len(side._found) for side in search.lists) > 4
     for expected, actual in zip(one, candidate_pairs(search), strict=True):
         np.testing.assert_array_equal(expected, actual)

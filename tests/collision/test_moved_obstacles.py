@@ -59,7 +59,7 @@ def test_fast_rising_obstacles_lift_a_rod(device, shape):
     scene = bar(1.3 * RADIUS, friction=0.5)
     scene.add_obstacle(SHAPES[shape], motion=motion)
     model, integrator, state = run(scene, device, 25)
-    step, gap = height / 20, model.coupled.host.touching.reach
+    step, gap = height / 20, model.coupled.host.contact_parameters.search_distance
     assert step > 2.0 * gap
     z = state.points()[:, 2]
     assert z[5] > height + 0.9 * RADIUS
@@ -114,7 +114,7 @@ def test_rotating_surfaces_accelerate_a_rod_by_friction(device, shape, drive):
         np.diff(speeds)[sliding].sum() / dt, mu * np.sum(normal_forces[sliding]) / mass, rtol=0.03
     )
     np.testing.assert_allclose(np.sum(couples[sliding]), mu * radius * np.sum(normal_forces[sliding]), rtol=0.03)
-    assert abs(speeds[-1] - speed) < model.scene.touching.velocity
+    assert abs(speeds[-1] - speed) < model.scene.contact_parameters.velocity
     assert abs(couples[-1]) < 0.05 * mu * radius * normal_forces[-1]
 
 

@@ -189,7 +189,7 @@ def test_one_law_is_compiled_once_for_all_numbers_of_contact(device):
     """Kernels take stiffness and range as arguments, and other parameters of the law as constants."""
     law, cubic = (ddg.Law(power, power=exponent) for exponent in (2.0, 3.0))
     touching = [
-        sheet_on_floor(*arguments).build(device, "float64").coupled.host.touching.density
+        sheet_on_floor(*arguments).build(device, "float64").coupled.host.contact_parameters.density
         for arguments in ((law, 40.0), (law, 50.0), (cubic, 40.0))
     ]
     assert touching[0] is touching[1]

@@ -60,7 +60,7 @@ def test_blocks_and_stiffness_equal_the_matrix(device, form):
     result, positions = terms(shapes, x, device, friction=MU, velocity=VELOCITY, friction_law=form)
     result.lag(positions)
     positions.assign(x + SLIPS[form] * np.random.default_rng(1).normal(size=x.shape))
-    n, nodes = len(x), shapes.things(2)[0]
+    n, nodes = len(x), shapes.primitives(2)[0]
     for rate in (None, rates(result)):
         result.evaluate(positions, rate)
         matrix = assembled_hessian(result, n).transpose(0, 2, 1, 3)
@@ -224,5 +224,5 @@ def test_no_friction_without_rate_or_coefficient(device):
     some.evaluate(positions, rates(some))
     for part, sizes in zip(some.frictions, ((2, 2), (1, 3)), strict=True):
         pairs = part.pairs.numpy()[used_pairs(part)]
-        first, second = (groups[shapes.things(size)[2][pairs[:, side]]] for side, size in enumerate(sizes))
+        first, second = (groups[shapes.primitives(size)[2][pairs[:, side]]] for side, size in enumerate(sizes))
         assert len(pairs) > 5 and (first != second).all()

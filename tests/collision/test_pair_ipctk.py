@@ -64,22 +64,22 @@ def positions(stencil: str, inside: bool) -> np.ndarray:
         x[:, 2:, 2] -= 0.9
     corners = x[:, :4]
     d = STENCILS[stencil](*corners.transpose(1, 0, 2))
-    keep = (d > 0.02 * RANGE) & (d < 0.95 * RANGE)
+    min_separation_fraction = (d > 0.02 * RANGE) & (d < 0.95 * RANGE)
     if stencil == "edge_edge":
         normal = np.cross(x[:, 1] - x[:, 0], x[:, 3] - x[:, 2])
-        keep &= (normal**2).sum(1) > 2e-3
+        min_separation_fraction &= (normal**2).sum(1) > 2e-3
         height = np.abs(((x[:, 2] - x[:, 0]) * normal).sum(1)) / np.linalg.norm(normal, axis=1)
     else:
         normal = np.cross(x[:, 2] - x[:, 1], x[:, 3] - x[:, 1])
         height = np.abs(((x[:, 0] - x[:, 1]) * normal).sum(1)) / np.linalg.norm(normal, axis=1)
     inner = np.abs(height - d) < 1e-9
-    return x[keep & inner if inside else keep][:COUNT]
+    return x[min_separation_fraction & inner if inside else min_separation_fraction][:COUNT]
 
 
 def terms(stencil: str, x: np.ndarray, device, **options) -> tuple[ContactPotential, wp.array]:
     """Return the terms of this kind of pair alone, and positions on the device."""
     points = upload(x.reshape(-1, 3), device)
-    search = BroadPhase(scene(stencil), points, len(x), reach=RANGE, margin=0.1)
+    search = BroadPhase(scene(stencil), points, len(x), search_distance=RANGE, margin=0.1)
     result = ContactPotential(search, log_barrier, stiffness=STIFFNESS, range=RANGE, thickness=0.0, **options)
     result.lists, result.frictions = result.lists[-1:], result.frictions[-1:]
     return result, points

@@ -111,7 +111,7 @@ def test_blocks_equal_the_matrix(device, law):
     n = len(x)
     matrix = assembled_hessian(result, n).transpose(0, 2, 1, 3)
     _, _, diagonal, between = state(result)
-    nodes = shapes.things(2)[0]
+    nodes = shapes.primitives(2)[0]
     largest = np.abs(matrix).max()
     blocks = matrix[np.arange(n), np.arange(n)]
     assert np.abs(diagonal - blocks).max() < 1e-13 * largest
@@ -179,7 +179,7 @@ def test_the_order_of_objects_does_not_matter(device):
     rods, edges = 3, 4
     n = len(x)
     backwards = CollisionMesh(shapes.points[::-1])
-    triangles = n - 1 - shapes.things(3)[0]
+    triangles = n - 1 - shapes.primitives(3)[0]
     backwards.shell(triangles[::-1, [1, 2, 0]], 0.004)
     for r in reversed(range(rods)):
         backwards.rod(n - 1 - (r * (edges + 1) + np.arange(edges + 1)), 0.003)
@@ -267,7 +267,7 @@ def test_float32_positions(device, case):
     """Positions of 0.3 m err by 1e-8 m, gaps of 1e-3 m by 1e-5 of the gap."""
     shapes, x = CASES[case]()
     points = upload(x, device, wp.vec3f)
-    search = BroadPhase(shapes, points, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, points, search_distance=REACH, margin=MARGIN)
     result = ContactPotential(search, smooth_penalty, **LAWS["penalty"][1])
     result.evaluate(points)
     assert result.energy.numpy()[0] == pytest.approx(
@@ -303,6 +303,6 @@ def test_float32_positions(device, case):
 )
 def test_invalid_parameters_are_refused_by_name(device, options, message):
     shapes, x = bundle()
-    search = BroadPhase(shapes, upload(x, device), reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, upload(x, device), search_distance=REACH, margin=MARGIN)
     with pytest.raises(SceneError, match=message):
         ContactPotential(search, smooth_penalty, **{"stiffness": 1.0, "range": REACH, **options})

@@ -27,7 +27,7 @@ class Culling:
 
     def __init__(self, shapes: CollisionMesh, points: np.ndarray, device, worlds: int = 1, dtype=wp.vec3d):
         self.device, self.worlds, self.dtype = device, worlds, dtype
-        self.search = BroadPhase(shapes, self._upload(points), worlds, reach=REACH, margin=MARGIN)
+        self.search = BroadPhase(shapes, self._upload(points), worlds, search_distance=REACH, margin=MARGIN)
         self.runs = RodCulling(self.search)
 
     def __call__(self, x: np.ndarray, y: np.ndarray | None = None, tried=1) -> np.ndarray:

@@ -56,7 +56,7 @@ def test_internal_contact_conserves_momentum(device, friction, law):
         after, points = state.velocities(), state.points()
         forces = contact.forces.numpy()[: len(speed)]  # with friction
         assert np.abs(forces.sum(0)).max() <= 1e-13 * max(np.abs(forces).sum(), 1e-300)
-        model.touch.at(state.coupled.q)
+        model.touch.evaluate(state.coupled.q)
         forces = model.touch.terms.forces.numpy()[: len(speed)]  # without
         largest = max(largest, np.abs(forces).sum())
         moments = np.cross(points, forces)

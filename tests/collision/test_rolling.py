@@ -241,7 +241,7 @@ def test_blocks_equal_the_matrix(device, form):
     assert np.linalg.eigvalsh(flat).min() > -1e-13 * largest
     result.join()
     first, second, neighbour = (array.numpy() for array in result.blocks.turned)
-    (nodes, *_), angles = shapes.things(2), shapes.angles(2)[:, 0]
+    (nodes, *_), angles = shapes.primitives(2), shapes.angles(2)[:, 0]
     rolling = np.flatnonzero(angles >= 0)
     assert np.abs(first).max() > 1e-3 * largest and np.abs(neighbour).max() > 1e-7 * largest
     index = np.arange(n)

@@ -57,7 +57,7 @@ def rod_on_ball(scene, offset, lift: float) -> float:
     return -RADIUS
 
 
-def record_directions(device, scene, velocities, worlds: int = 1, linear="chain", **options):
+def record_directions(device, scene, velocities, worlds: int = 1, linear="substructuring", **options):
     """Launch a step without capture; return the end state, nodes there, and every direction with the nodes before."""
     model = scene.build(device=device, worlds=worlds)
     integrator = ddg.Integrator(model, linear=linear, **options)
@@ -103,7 +103,7 @@ def test_islands_converge_independently(device):
 @covering(
     1,
     made=(joined_over_beam, sheet_over_beam, rod_on_ball),
-    linear=("block_jacobi", "chain", "multilevel", "chain_multilevel"),
+    linear=("block_jacobi", "substructuring", "multilevel", "substructuring_multilevel"),
 )
 def test_islands_of_joined_rods_sheets_and_balls(device, made, linear):
     """One of two objects flies as predicted and sleeps while the other meets an object below.
@@ -154,7 +154,7 @@ def test_islands_are_connected_components_of_the_pairs(device):
     scene.contact(range=1e-2)
     model = scene.build(device=device)
     state, _ = model.resolve_overlaps(model.state())
-    integrator = ddg.Integrator(model, linear="chain")
+    integrator = ddg.Integrator(model, linear="substructuring")
     integrator.step(state, 1e-4)
     newton = integrator._coupled.newton
     newton.islands.needs_direction.fill_(1)

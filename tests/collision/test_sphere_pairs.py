@@ -28,7 +28,7 @@ def rods_shell_and_balls(seed: int) -> tuple[CollisionMesh, np.ndarray]:
 
 def test_balls_pair_with_edges_of_rods(device):
     shapes, points = rods_shell_and_balls(18)
-    search = BroadPhase(shapes, upload(points, device), reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, upload(points, device), search_distance=REACH, margin=MARGIN)
     assert [pairs.second.size for pairs in search.lists] == [2, 3, BALLS]
     for candidates, side in zip(candidate_pairs(search), (*SIDES, (2, BALLS)), strict=True):
         pairs = {tuple(pair) for pair in candidates.tolist()}
@@ -39,9 +39,9 @@ def test_balls_pair_with_edges_of_rods(device):
         )
         assert len(pairs) > 20
     one = candidate_pairs(search)[2][0]
-    owner = shapes.names[shapes.things(2)[2][one[0]]]
+    owner = shapes.names[shapes.primitives(2)[2][one[0]]]
     assert search.describe(search.lists[2], *one.tolist()) == (
-        f"edge {one[0] % 20} of {owner} (nodes {', '.join(map(str, shapes.things(2)[0][one[0]]))}) and ball {35 + one[1]} "
+        f"edge {one[0] % 20} of {owner} (nodes {', '.join(map(str, shapes.primitives(2)[0][one[0]]))}) and ball {35 + one[1]} "
         f"(node {len(points) - 30 + one[1]})"
     )
 
@@ -69,12 +69,12 @@ def test_rod_stops_at_a_ball(device):
 def test_obstacles_form_no_pairs_with_each_other(device):
     shapes, points = scene(19, 0.3, rods=12, triangles=40)
     x = upload(points, device)
-    everything = candidate_pairs(BroadPhase(shapes, x, reach=REACH, margin=MARGIN))
+    everything = candidate_pairs(BroadPhase(shapes, x, search_distance=REACH, margin=MARGIN))
     shapes.obstacle.update({0, 3, 4, 13, 14, 16})
-    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, x, search_distance=REACH, margin=MARGIN)
     still = np.array(sorted(shapes.obstacle))
     for candidates, every, (first, second) in zip(candidate_pairs(search), everything, SIDES, strict=True):
-        owners = shapes.things(first)[2][every[:, 0]], shapes.things(second)[2][every[:, 1]]
+        owners = shapes.primitives(first)[2][every[:, 0]], shapes.primitives(second)[2][every[:, 1]]
         both = np.isin(owners[0], still) & np.isin(owners[1], still)
         assert candidates.tolist() == every[~both].tolist()
         assert both.sum() > 3
@@ -105,7 +105,7 @@ def test_energies_forces_and_products_of_ball_pairs(device):
     rng = np.random.default_rng(3)
     density, parameters = LAWS["penalty"]
     positions = upload(x, device)
-    search = BroadPhase(shapes, positions, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, positions, search_distance=REACH, margin=MARGIN)
     terms = ContactPotential(search, density, **parameters)
 
     def energy(y: np.ndarray) -> float:

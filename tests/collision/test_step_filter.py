@@ -25,8 +25,8 @@ def random_displacements(shapes: CollisionMesh, rng, size: float, kind: str) -> 
     """Return random displacements of nodes, or of objects with a tenth of node motion added."""
     move = rng.normal(size=shapes.points.shape)
     if kind != "node":
-        unit, units = ccd_bodies(shapes, "object")
-        move = rng.normal(size=(units, 3))[unit] + 0.1 * move
+        ccd_body, num_ccd_bodies = ccd_bodies(shapes, "object")
+        move = rng.normal(size=(num_ccd_bodies, 3))[ccd_body] + 0.1 * move
     return size * move
 
 
@@ -41,12 +41,12 @@ def test_limited_motions_close_no_gap_and_never_cross(device, kind, size, dtype)
         landing = motion(move).astype(float)
         search, fractions = motion.search, motion.search.shares.numpy()
         assert (
-            fractions.shape == (motion.units,)
+            fractions.shape == (motion.num_ccd_bodies,)
             and 0.0 < fractions.min() == search.time.numpy()[0] <= fractions.max() <= 1.0
         )
         assert search.limited.numpy()[0] == (fractions < 1.0).sum()
         assert landing == pytest.approx(
-            base + fractions[motion.unit.numpy()][:, None] * move, rel=rounding, abs=rounding
+            base + fractions[motion.ccd_body.numpy()][:, None] * move, rel=rounding, abs=rounding
         )
         for t in np.linspace(0.0, 1.0, 5):
             for side in SIDES:
@@ -98,7 +98,7 @@ def test_common_motion_needs_no_more_candidates_than_rest(device):
     shapes, points = tangle(9)
     move = np.tile([0.3, 0.4, 0.0], (len(points), 1))
     x, step = upload(points, device), upload(move, device)
-    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, x, search_distance=REACH, margin=MARGIN)
     rest = [candidates.tolist() for candidates in candidate_pairs(search)]
     search.search(x, step, wp.ones(1, dtype=int, device=device))
     assert [candidates.tolist() for candidates in candidate_pairs(search)] == rest
@@ -183,7 +183,7 @@ def test_search_along_a_motion_finds_pairs_of_any_step_fractions(device, togethe
     rng = np.random.default_rng(13)
     move = random_displacements(shapes, rng, 2.0 * MARGIN, "object")
     x, step = upload(points, device), upload(move, device)
-    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, x, search_distance=REACH, margin=MARGIN)
     flags = wp.full(1, int(together), dtype=int, device=device)
     search.search(x, step, flags)
     if search.fit(x):
@@ -233,7 +233,7 @@ def test_overflowing_lists_stop_all_motion(device):
         pairs.reserve(10)
     motion.q.assign(points + random_displacements(shapes, np.random.default_rng(17), 0.05, "object"))
     motion.launch()
-    used = motion.unit.numpy() >= 0
+    used = motion.ccd_body.numpy() >= 0
     assert (motion.q.numpy()[used] == points[used]).all()
     assert motion.search.time.numpy()[0] == 0.0 and motion.search.overflow.numpy()[0] == 1
 
@@ -247,7 +247,7 @@ def test_smallest_gaps(device):
     for k in range(6):
         shapes.rod([2 * k, 2 * k + 1], 0.01)
     x = upload(np.concatenate([shapes.points, 2.0 * shapes.points]), device)
-    search = BroadPhase(shapes, x, 2, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, x, 2, search_distance=REACH, margin=MARGIN)
     search.measure(x)
     assert search.gap.numpy() == pytest.approx([gap[0], REACH], rel=1e-9)
 
@@ -255,17 +255,22 @@ def test_smallest_gaps(device):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"keep": -0.1}, r"keep = -0\.1"),
-        ({"units": 0}, "units = 0 of a motion; they are 1 to"),
-        ({"unit": 7}, "unit of a motion: one int32 for each of 72 nodes, not"),
+        ({"min_separation_fraction": -0.1}, r"min_separation_fraction = -0\.1"),
+        ({"num_ccd_bodies": 0}, "num_ccd_bodies = 0 of a motion; they are 1 to"),
+        ({"ccd_body": 7}, "ccd_body of a motion: one int32 for each of 72 nodes, not"),
         ({"together": 2}, r"together of a motion: one int32 for each of 1 world\(s\), not"),
     ],
 )
 def test_invalid_filter_arguments_are_refused_by_name(device, change, message):
     shapes, points = scene(12, 1.0, rods=3, nodes=20, triangles=4)
     motion = Motion(shapes, points, device)
-    arguments = {"unit": motion.unit, "together": motion.together, "units": motion.units, "keep": 1.0}
+    arguments = {
+        "ccd_body": motion.ccd_body,
+        "together": motion.together,
+        "num_ccd_bodies": motion.num_ccd_bodies,
+        "min_separation_fraction": 1.0,
+    }
     for name, value in change.items():
-        arguments[name] = wp.zeros(value, dtype=int, device=device) if name in ("unit", "together") else value
+        arguments[name] = wp.zeros(value, dtype=int, device=device) if name in ("ccd_body", "together") else value
     with pytest.raises(SceneError, match=message):
         motion.search.filter(motion.base, motion.q, **arguments)

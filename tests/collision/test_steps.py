@@ -160,7 +160,7 @@ def test_forces_are_derivatives_of_the_contact_energy(device, law):
         displaced.coupled.q.assign(q + h * direction)
         return model.energies(displaced)["contact"]
 
-    model.touch.at(state.coupled.q)
+    model.touch.evaluate(state.coupled.q)
     slope = -(model.touch.terms.forces.numpy() * direction).sum()
     h = 1e-8
     assert slope != 0.0

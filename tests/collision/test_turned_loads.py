@@ -7,14 +7,14 @@ from turn_cases import LAST, OBSTACLES, RADIUS, angles_ahead, polar_point, rotat
 import ddg_warp as ddg
 
 
-def rod_before_blade(motion, centre, reach=None) -> ddg.Scene:
+def rod_before_blade(motion, centre, search_distance=None) -> ddg.Scene:
     """Return a soft rod fixed at both ends, in the path of a rotating capsule."""
     made = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     line = np.linspace((*centre, -0.1), (*centre, 0.1), 11)
     rod = made.add_rod(line, section=ddg.Circle(RADIUS), material=ddg.Material(young=1e5, density=1000.0), twist=False)
     made.fix(rod, [0, -1])
     made.add_obstacle(OBSTACLES["capsule"], motion=motion, name="blade")
-    made.contact(stiffness=100.0, range=reach)
+    made.contact(stiffness=100.0, range=search_distance)
     return made
 
 
@@ -35,7 +35,7 @@ def test_load_increments_are_split_by_rotation(device, drive):
 
 def test_unresolved_increments_are_refused_with_sufficient_load_steps(device):
     motion = ddg.Motion(angle=lambda t: 80.0 * np.pi * t)
-    model = rod_before_blade(motion, polar_point(0.1, 1.0), reach=2e-5).build(device=device)
+    model = rod_before_blade(motion, polar_point(0.1, 1.0), search_distance=2e-5).build(device=device)
     with pytest.raises(ddg.SolverError, match=r"obstacle 0 \('blade'\) rotates by 40 turns in a step") as error:
         ddg.statics.solve(model)
     assert error.value.outcome == "turned_too_far"

@@ -240,7 +240,7 @@ def test_straight_motion_is_never_split(device):
 
 
 def test_unresolved_rotations_are_refused_with_a_sufficient_step(device):
-    made = scene("capsule", rotating(40.0), polar_point(0.1, -1.5), reach=2e-5)
+    made = scene("capsule", rotating(40.0), polar_point(0.1, -1.5), search_distance=2e-5)
     with pytest.raises(ddg.SolverError, match=r"turned_too_far: obstacle 0 \('blade'\) rotates by 40 turns") as error:
         step(made, device)
     assert error.value.outcome == "turned_too_far"
@@ -269,7 +269,7 @@ def test_grips_rotate_by_at_most_half_a_revolution(device):
 def test_unresolved_grip_fails_its_world_alone(device):
     turns = np.zeros((2, 1, 6))
     turns[1, 0, 5] = np.pi
-    model = scene("capsule", ddg.Grip(), polar_point(0.1, -1.5), reach=2e-7).build(device=device, worlds=2)
+    model = scene("capsule", ddg.Grip(), polar_point(0.1, -1.5), search_distance=2e-7).build(device=device, worlds=2)
     integrator = ddg.Integrator(model, failures="flag")
     state = integrator.step(model.state(), DT, ddg.Controls(poses=turns))
     assert integrator.outcomes().tolist() == ["converged", "turned_too_far"]

@@ -37,7 +37,9 @@ SUPPORTS = ("clamp", "fix", "hold")
 KINDS = (*OBSTACLES, *SUPPORTS)
 
 
-def scene(kind: str, motion, centres, reach: float | None = None, first: float = FIRST, **contact) -> ddg.Scene:
+def scene(
+    kind: str, motion, centres, search_distance: float | None = None, first: float = FIRST, **contact
+) -> ddg.Scene:
     """Return a scene of a moving blade from radius `first` on and short rods along z, through `centres` (n, 2).
 
     Strong damping stops the rods wherever contact ends.
@@ -58,7 +60,7 @@ def scene(kind: str, motion, centres, reach: float | None = None, first: float =
             made.fix(blade, np.arange(7), motion=motion)
         else:
             made.clamp_end(blade, "first", motion=motion)
-    made.contact(stiffness=1e4, range=reach, **contact)
+    made.contact(stiffness=1e4, range=search_distance, **contact)
     return made
 
 

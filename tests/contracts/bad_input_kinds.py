@@ -111,7 +111,7 @@ each("kinds: names", "objects", [[["a"]], [3], 3, [], [b"rod"]],
 each("kinds: names", "radius", [{3: 0.1}, {("a",): 0.1}, [0.1]], lambda v: rods().contact(radius=v), "contact:", "radius")
 each("kinds: names", "precision", [["float64"], {"a": 1}, b"float64", 3], lambda v: clamped().build("cpu", v), "precision", "mixed")
 each("kinds: names", "device", [[], 0, {"a": 1}, b"cpu"], lambda v: clamped().build(v), "device")
-each("kinds: names", "linear", [["sweep"], {"a": 1}, b"sweep"], lambda v: ddg.Integrator(model(), linear=v), "partitioned")
+each("kinds: names", "linear", [["sweep"], {"a": 1}, b"sweep"], lambda v: ddg.Integrator(model(), linear=v), "cyclic_reduction")
 each("kinds: names", "mode", [["follow"], b"follow"], lambda v: statics.solve(model(), mode=v), "mode", "minimise")
 each("kinds: names", "displacement", [["tip"], {"a": 1}, None],
      lambda v: continuation.Continuation(model(), {"tip": ddg.Displacement.of(6, "z")}).control(v, [0.1]), "is watched")

@@ -17,14 +17,14 @@ def _controlled(**options) -> ddg.AdaptiveStepper:
 each("Integrator", "model", [None, 3, "rods"], ddg.Integrator, "Integrator", "scene.build()")
 refuse("Integrator", {
     "a scene": (lambda: ddg.Integrator(rods()), "Integrator", "Scene", "scene.build()"),
-    "partitioned ring": (lambda: ddg.Integrator(built(rods(RING, closed=True)), linear="partitioned"), "rod 1", "closed", "auto"),
+    "partitioned ring": (lambda: ddg.Integrator(built(rods(RING, closed=True)), linear="cyclic_reduction"), "rod 1", "closed", "auto"),
     "massless": (lambda: ddg.Integrator(_massless()), "node 2", "rod 1", "no mass", "density"),
     "massless net": (lambda: ddg.Integrator(_massless(True)), "node 2 of rod 1", "no mass", "density"),
     "massless, drag across": (lambda: ddg.Integrator(_massless(drag=True)), "node 2", "rod 1", "no mass", "drag along and across"),
     "massless net, drag across": (lambda: ddg.Integrator(_massless(True, True)), "node 2 of rod 1", "drag along and across"),
-    "chain rods": (lambda: ddg.Integrator(model(), linear="chain"), "'chain'", "coupled systems", "auto"),
+    "chain rods": (lambda: ddg.Integrator(model(), linear="substructuring"), "'substructuring'", "coupled systems", "auto"),
     "multilevel rods": (lambda: ddg.Integrator(model(), linear="multilevel"), "'multilevel'", "coupled systems", "auto"),
-    "chain_multilevel rods": (lambda: ddg.Integrator(model(), linear="chain_multilevel"), "coupled systems", "auto"),
+    "chain_multilevel rods": (lambda: ddg.Integrator(model(), linear="substructuring_multilevel"), "coupled systems", "auto"),
     "sweep of a net": (lambda: ddg.Integrator(model("net"), linear="sweep"), "'sweep'", "with a coupled system"),
     "psd of a projective net": (lambda: ddg.Integrator(model("net"), psd="none", solver="projective"), "'none'", "projective"),
     "psd none of a sheet": (lambda: ddg.Integrator(model("hinge"), psd="none"), "'none'", "left out", "progressive"),
@@ -40,7 +40,7 @@ each(
     "implicit_midpoint",
 )
 each("Integrator", "solver", ["magic", None], lambda v: ddg.Integrator(model(), solver=v), "solver", "newton", "projective")
-each("Integrator", "linear", ["ilu", None, 3], lambda v: ddg.Integrator(model(), linear=v), "linear", "sweep", "partitioned")
+each("Integrator", "linear", ["ilu", None, 3], lambda v: ddg.Integrator(model(), linear=v), "linear", "sweep", "cyclic_reduction")
 each(
     "Integrator",
     "retry_limit",

@@ -83,7 +83,8 @@ def observe_integrator(
 
 FAILS = {"max_iterations": 1, "retry_limit": 1, "rtol": 1e-12}
 CALLS["Integrator"] = Call(ddg.Integrator, observe_integrator, {}, {
-    "scheme": "implicit_midpoint", "solver": "projective", "linear": "partitioned", "retry_limit": Change(0, {"max_iterations": 2}, 20),
+    "scheme": "implicit_midpoint", "solver": "projective", "linear": "cyclic_reduction",
+    "retry_limit": Change(0, {"max_iterations": 2}, 20),
     "energy_bound": Change(1e-9, {"scheme": "implicit_midpoint"}), "check_every": Change(2, FAILS), "failures": Change("flag", FAILS),
     "gyroscopic": Change(False, {"kind": "falling", "spins": 500.0}), "rtol": 1e-2, "floor_factor": Change(1e9, {"rtol": 1e-14}),
     "max_iterations": 1, "max_halvings": Change(1, {"points": ODD, "dt": 1.0, "rotation_cap": 20.0, "retry_limit": 1}),

@@ -401,7 +401,7 @@ def test_indefinite_matrix_drops_compression(device):
     integrator = ddg.Integrator(scene.build(device, "float64"), psd="gauss_newton")
     state = integrator.model.state(points=points * [0.99, 1.0, 1.0] + [0.0, 0.0, 1e-4] * np.arange(12)[:, None] ** 2)
     state = integrator.step(state, 1.0)
-    newton = integrator._chains[0].newton
+    newton = integrator._rod_steps[0].newton
     assert newton.islands.drop_compression.numpy()[0] == 1
     assert set(integrator.statistics()["outcomes"]) <= {"converged", "converged_to_rounding"}
     assert state.points()[-1, 0] < 0.5  # 50 is twenty times the load of Euler

@@ -23,7 +23,7 @@ DAILY = {
 }
 POTENTIALS = {**CONTACT, **FRICTION}
 SAMPLES = {
-    (precision, name, sample.chain): sample
+    (precision, name, sample.layout): sample
     for precision in ("float64", "float32")
     for name, term in ALL.items()
     for sample in derivative_checks.samples_of(term, precision)
@@ -82,16 +82,16 @@ plane = replace(right, measure=replace(right.measure, dim=2))
 
 
 @cache
-def sample_on(device: str, precision: str, term: str, chain: str) -> derivative_checks.Sample:
+def sample_on(device: str, precision: str, term: str, layout: str) -> derivative_checks.Sample:
     """Return the sample on the device under test."""
-    closed = {"open": (False,), "closed": (True,)}.get(chain, ())
+    closed = {"open": (False,), "closed": (True,)}.get(layout, ())
     (sample,) = derivative_checks.samples_of(ALL[term], precision, device, closed)
     return sample
 
 
-@pytest.mark.parametrize(("precision", "term", "chain", "check"), CASES)
-def test_derivative(device, precision, term, chain, check):
-    row = derivative_checks.row(sample_on(device, precision, term, chain), check)
+@pytest.mark.parametrize(("precision", "term", "layout", "check"), CASES)
+def test_derivative(device, precision, term, layout, check):
+    row = derivative_checks.row(sample_on(device, precision, term, layout), check)
     assert row["passed"], f"error {row['error']:.2e}, tolerance {row['tolerance']:.0e}"
 
 
@@ -132,13 +132,13 @@ def test_every_term_has_every_check():
     Dipoles have no rest shape. Potentials have no rest shape and no reverse mode of the energy. Only friction has lagged data.
     """
     of_terms, of_collisions = {"energy", "resultant"}, {"gradient", "rest", "rigid"}
-    for (precision, name, chain), sample in SAMPLES.items():
+    for (precision, name, layout), sample in SAMPLES.items():
         left_out = {
             "open": of_terms,
             "closed": of_terms,
-            "net": of_terms | {"rigid"} | (set() if name.startswith("rigid_joint") else {"exact"}),
+            "coupled": of_terms | {"rigid"} | (set() if name.startswith("rigid_joint") else {"exact"}),
             "pair": of_collisions | ({"symmetry", "factor", "exact"} if name in FRICTION else {"lagged"}),
-        }[chain]
+        }[layout]
         left_out = left_out | ({"downcast"} if precision == "float32" else set())
         left_out = left_out | ({"rest"} if name.startswith(("magnetic", "dipoles")) else set())
         assert set(derivative_checks.CHECKS) - set(derivative_checks.checks_of(sample)) == left_out
@@ -177,7 +177,9 @@ def test_sample_of_chains_is_general(term):
 
 def test_sample_of_nets_is_general():
     """Samples have all kinds of edges, both signs of a joint, and old frames."""
-    bend, joint, glue = (SAMPLES["float64", name, "net"] for name in ("shell_bend_dof", "rigid_joint", "glued_edge"))
+    bend, joint, glue = (
+        SAMPLES["float64", name, "coupled"] for name in ("shell_bend_dof", "rigid_joint", "glued_edge")
+    )
     assert set(bend.data["constants"][:3].ravel()) == {0.0, 1.0, 2.0, 3.0}
     assert set(joint.data["constants"][0]) == {-1.0, 1.0}
     edge = joint.data["q"][joint.slots[1]] - joint.data["q"][joint.slots[0]]
@@ -192,11 +194,11 @@ def test_sample_of_nets_is_general():
 @pytest.mark.slow
 def test_table_has_chains_and_nets(device):
     """Rows of rods and indexed elements have equal columns, so that one table shows them."""
-    chain, coupled = (derivative_checks.table(name, "float64", device) for name in ("planar_stretch", "shell_tilt"))
-    assert chain[0].keys() == coupled[0].keys()
+    layout, coupled = (derivative_checks.table(name, "float64", device) for name in ("planar_stretch", "shell_tilt"))
+    assert layout[0].keys() == coupled[0].keys()
     count = len(derivative_checks.CHECKS) - 2  # without the checks of collisions
-    assert [row["chain"] for row in chain] == ["open"] * count + ["closed"] * count
-    assert {row["chain"] for row in coupled} == {"net"}
+    assert [row["layout"] for row in layout] == ["open"] * count + ["closed"] * count
+    assert {row["layout"] for row in coupled} == {"coupled"}
 
 
 def test_sample_of_collisions_is_general():
@@ -214,5 +216,5 @@ def test_sample_of_collisions_is_general():
 def test_measures_are_those_of_chains_or_nets():
     """Every listed term has samples: open and closed rods, collisions as pairs, other terms by index."""
     for name in ALL:
-        chains = {chain for precision, term, chain in SAMPLES if term == name and precision == "float64"}
-        assert chains == ({"open", "closed"} if name in REGISTRY else {"pair" if name in POTENTIALS else "net"})
+        layouts = {layout for precision, term, layout in SAMPLES if term == name and precision == "float64"}
+        assert layouts == ({"open", "closed"} if name in REGISTRY else {"pair" if name in POTENTIALS else "coupled"})

@@ -107,7 +107,7 @@ class Problem:
         stretch=1.0,
         precision="float64",
         preconditioner="block_jacobi",
-        noise=0.02,
+        rounding_error=0.02,
         seed=3,
         psd="auto",
     ):
@@ -117,12 +117,12 @@ class Problem:
         self.coupled, self.worlds, self.blocks = coupled, 2, coupled.blocks
         q = self.state.coupled.q.numpy().astype(float)
         free = np.tile(~coupled.host.fixed, (2, 1))
-        q[:] = q * stretch + noise * random.normal(size=q.shape) * free
+        q[:] = q * stretch + rounding_error * random.normal(size=q.shape) * free
         self.state.coupled.q.assign(q)
         newton = self.newton = CoupledNewton(self.model, NewtonOptions(psd=psd), preconditioner)
         wp.copy(newton.iterates.q, self.state.coupled.q)
         wp.copy(newton.iterates.base, self.state.coupled.q)
-        newton.iterates.target.assign(q + 5.0 * noise * random.normal(size=q.shape) * free)
+        newton.iterates.target.assign(q + 5.0 * rounding_error * random.normal(size=q.shape) * free)
         newton.islands.inertia_coefficient.assign([30.0, 50.0])
         newton.islands.inverse_step.fill_(1.0)
         newton.islands.needs_direction.fill_(1)
@@ -132,8 +132,8 @@ class Problem:
         newton.evaluate(self.state.coupled)
         newton.balance()
         newton.assemble()
-        if newton.chains and newton.chains.exact:  # direct substructuring assembles during the solve
-            newton.chains.bands.assemble(newton.system.matrix, newton.loading.mass, newton.islands)
+        if newton.substructuring and newton.substructuring.exact:  # direct substructuring assembles during the solve
+            newton.substructuring.bands.assemble(newton.system.matrix, newton.loading.mass, newton.islands)
         return self
 
     def iterate(self, forcing: float):
@@ -152,13 +152,13 @@ class Problem:
         values = self.newton.system.matrix.numpy().reshape(9, 2, -1)[:, world].copy()
         padding = rows < 0
         assert not values[:, padding].any()
-        if self.newton.chains and self.newton.chains.exact:
-            values[:, self.newton.chains.plan.taken] = 0.0  # never cleared: the bands hold these blocks
+        if self.newton.substructuring and self.newton.substructuring.exact:
+            values[:, self.newton.substructuring.plan.taken] = 0.0  # never cleared: the bands hold these blocks
         H = np.zeros((N, 3, N, 3))
         for p in np.flatnonzero(~padding):
             H[rows[p], :, columns[p]] += values[:, p].reshape(3, 3)
         H = H.reshape(3 * N, 3 * N)
-        chains = self.newton.chains
+        chains = self.newton.substructuring
         if chains is None or not chains.banded:
             return H
         plan, bands = chains.plan, chains.bands.blocks.numpy()[:, :, world * chains.paths.width :]

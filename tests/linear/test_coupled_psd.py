@@ -45,7 +45,7 @@ def matrices(problem: Problem, iterations: list[int], clamped: int) -> list[np.n
 @pytest.mark.parametrize("scene", [branches, ring_and_spokes, pytest.param(hinged_grid, marks=pytest.mark.slow)])
 def test_matrix_is_exact_hessian(device, scene):
     """H of rods, rigid joints rotated by 0.1 rad and cables is exact, when bent, twisted and compressed."""
-    problem = Problem(scene(), device, 0.97, noise=0.05, psd="progressive")
+    problem = Problem(scene(), device, 0.97, rounding_error=0.05, psd="progressive")
     (exact, expected), (gauss_newton, expected_early) = zip(
         matrices(problem, [LATE, 0], 0), map(problem.exact, range(2)), strict=True
     )
@@ -63,7 +63,7 @@ def deflected_cut_helix(device, psd: str):
     whole.add_rod(points, section=section, natural="shape")
     model = coupled_copy(whole, 6).build(device, "float64")
     newton, state, host = (
-        CoupledNewton(model, NewtonOptions(psd=psd, rtol=1e-13), "chain"),
+        CoupledNewton(model, NewtonOptions(psd=psd, rtol=1e-13), "substructuring"),
         model.state(),
         model.coupled.host,
     )

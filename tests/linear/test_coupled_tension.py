@@ -36,15 +36,21 @@ def rods_with_fixed_joints(axial: float = 1e4, twist: bool = True) -> ddg.Scene:
 
 
 def first_direction(
-    scene: ddg.Scene, device, linear, carried: float | None, noise: float = 1e-3
+    scene: ddg.Scene, device, linear, carried: float | None, rounding_error: float = 1e-3
 ) -> tuple[CoupledNewton, np.ndarray]:
-    """Return a solver of two worlds at iterates off rest by `noise` [m], and the first direction (worlds, blocks, 3)."""
+    """Return a solver of two worlds at iterates off rest by `rounding_error` [m], and the first direction (worlds, blocks, 3)."""
     random, model = np.random.default_rng(3), scene.build(device, "float64", worlds=2)
-    newton = CoupledNewton(model, NewtonOptions(psd="gauss_newton"), "chain", linear, split=carried is not None)
+    newton = CoupledNewton(
+        model, NewtonOptions(psd="gauss_newton"), "substructuring", linear, mixed_axial=carried is not None
+    )
     state, islands = model.state().coupled, newton.islands
     q = state.q.numpy()
     free = np.tile(~model.coupled.host.fixed, (2, 1))
-    for array, size in ((newton.iterates.q, noise), (newton.iterates.base, noise), (newton.iterates.target, 1e-3)):
+    for array, size in (
+        (newton.iterates.q, rounding_error),
+        (newton.iterates.base, rounding_error),
+        (newton.iterates.target, 1e-3),
+    ):
         array.assign(q + size * random.normal(size=q.shape) * free)
     islands.inertia_coefficient.fill_(100.0)
     islands.inverse_step.fill_(10.0)
@@ -55,7 +61,7 @@ def first_direction(
     islands.needs_direction.fill_(1)
     newton.assemble()
     newton.direct()
-    assert newton.chains.splits
+    assert newton.substructuring.allows_mixed_axial
     assert (newton.system.indefinite.numpy() == 0).all()
     return newton, newton.system.direction.numpy().astype(float).reshape(2, -1, 3)
 
@@ -73,9 +79,11 @@ def test_directions_match_full_matrix(device, twist):
         q = newton.iterates.q.numpy().reshape(2, -1, 3)
         edges, steps = q[:, b] - q[:, a], mixed[:, b] - mixed[:, a]
         along = np.sum(edges * steps, axis=-1) / np.linalg.norm(edges, axis=-1)
-        element = newton.chains.plan.elements(newton.coupled.host, element_set.host)[1]
+        element = newton.substructuring.plan.elements(newton.coupled.host, element_set.host)[1]
         k, c = np.nonzero(element >= 0)
-        longer = device_arrays.download(newton.chains.bands.longer).reshape(2, newton.chains.paths.longest, 2, -1)
+        longer = device_arrays.download(newton.substructuring.bands.longer).reshape(
+            2, newton.substructuring.paths.longest, 2, -1
+        )
         slack, lengthening = longer[:, k, :, c].transpose(1, 2, 0)
         assert (slack > 0.0).any() == (carried < 1e9)
         expected = along[:, element[k, c]]

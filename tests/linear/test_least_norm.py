@@ -20,7 +20,7 @@ def square_systems():
 
 @pytest.mark.parametrize(("matrix", "is_regular"), [*square_systems()])
 def test_shortest_solution(matrix, is_regular):
-    """Square systems are factorised as they are, singular and wide ones have the least norm."""
+    """Square systems are factorised directly, and singular and wide ones have the least norm."""
     matrix = csr_matrix(matrix)
     rhs = matrix @ np.random.default_rng(4).normal(size=matrix.shape[1])
     assert (sparse_direct._square_solve(csc_matrix(matrix)) is not None) == is_regular

@@ -98,7 +98,7 @@ def sheet_problem(device, stretch: float = 1.02, name: str = "flat", cells: int 
     scene = ddg.Scene()
     shell = scene.add_shell(points, triangles, thickness=0.01, material=RUBBER, bending="hinge")
     scene.hold(shell, [0, 3, cells], "xz")
-    return Problem(scene, device, stretch, preconditioner="multilevel", noise=1e-4)
+    return Problem(scene, device, stretch, preconditioner="multilevel", rounding_error=1e-4)
 
 
 def prolongations(levels, blocks: int) -> list[np.ndarray]:

@@ -46,7 +46,7 @@ def scene_of(name, counts=COUNTS, supported=True) -> ddg.Scene:
     return scene
 
 
-def solvers(name, device, clamped, precision="float64", noise=0.15, **options):
+def solvers(name, device, clamped, precision="float64", rounding_error=0.15, **options):
     """Yield a solver and a state of every rod group in two worlds, at random iterates; `clamped`: drop compression."""
     random = np.random.default_rng(11)
     model = scene_of(name, **options).build(device, precision, worlds=2)
@@ -54,11 +54,11 @@ def solvers(name, device, clamped, precision="float64", noise=0.15, **options):
         newton = RodNewtonParallel(model, group, NewtonOptions())
         x = device_arrays.download(state.x)
         for array in (newton.x, newton.target):
-            device_arrays.assign(array, x + noise * random.normal(size=x.shape))
+            device_arrays.assign(array, x + rounding_error * random.normal(size=x.shape))
         if group.kind.twist:
             wp.copy(newton.frame, state.frame)
             for array in (newton.theta, newton.target_angle):
-                device_arrays.assign(array, 2.0 * noise * random.normal(size=array.shape))
+                device_arrays.assign(array, 2.0 * rounding_error * random.normal(size=array.shape))
         newton.islands.inertia_coefficient.assign(random.uniform(1.0, 3.0, size=group.columns))
         newton.islands.inverse_step.fill_(1.0)
         newton.islands.drop_compression.fill_(int(clamped))
@@ -121,7 +121,7 @@ def test_direction_matches_dense_solve(device, name, precision, tolerance):
 def test_indefinite_matrices_lose_pivots(device):
     """A rod with an indefinite matrix stays and is retried without compression; the others move."""
     outcomes = set()
-    for newton, state in solvers("untwisted", device, clamped=False, noise=0.25):
+    for newton, state in solvers("untwisted", device, clamped=False, rounding_error=0.25):
         newton.islands.inertia_coefficient.fill_(0.3)
         before = device_arrays.download(newton.x)
         newton.iterate(state.last)
@@ -182,7 +182,7 @@ def test_edge_rotations_match_serial_kernel(device, name, supported):
 
 
 def test_frame_updates_match_serial_kernel(device):
-    for newton, state in solvers("twist", device, clamped=True, noise=0.3):
+    for newton, state in solvers("twist", device, clamped=True, rounding_error=0.3):
         if newton.group.kind.twist:
             newton.evaluate(state.last)
             before, (x, _, expected) = (
@@ -268,7 +268,7 @@ def test_steps_match_sweep(device, name, scheme):
     # no energy bound: the midpoint rule creates energy in the stiff scene, equally by both solvers
     options = {"rtol": 1e-13, "scheme": scheme, "energy_bound": None} | options
     swept, sweep_statistics = advance(build(), device, "sweep", **options)
-    state, statistics = advance(build(), device, "partitioned", **options)
+    state, statistics = advance(build(), device, "cyclic_reduction", **options)
     start = build().build(device).state().points()
     assert np.abs(swept.points() - start).max() > 0.005
     np.testing.assert_allclose(state.points(), swept.points(), rtol=0, atol=1e-12)
@@ -279,14 +279,14 @@ def test_steps_match_sweep(device, name, scheme):
 @pytest.mark.parametrize("name", ["cantilever", "hanging"])
 def test_iterations_match_sweep(device, name):
     build, options = SCENES[name]
-    (_, swept), (_, reduced) = (advance(build(), device, linear, **options) for linear in ("sweep", "partitioned"))
+    (_, swept), (_, reduced) = (advance(build(), device, linear, **options) for linear in ("sweep", "cyclic_reduction"))
     assert reduced["newton_iterations"] == swept["newton_iterations"]
     assert reduced["outcomes"] == swept["outcomes"]
 
 
 @pytest.mark.parametrize("precision", ["float64", pytest.param("mixed", marks=pytest.mark.slow)])
 def test_steps_repeat_bitwise(device, precision):
-    first, second = (advance(stiff(), device, "partitioned", precision=precision, steps=6)[0] for _ in range(2))
+    first, second = (advance(stiff(), device, "cyclic_reduction", precision=precision, steps=6)[0] for _ in range(2))
     np.testing.assert_array_equal(first.points(), second.points())
     np.testing.assert_array_equal(first.velocities(), second.velocities())
 
@@ -294,7 +294,7 @@ def test_steps_repeat_bitwise(device, precision):
 def test_free_rod_balances_momentum(device):
     """Momentum grows by the sum of external forces times h per step."""
     dt, steps = 1e-3, 20
-    state, _ = advance(free(), device, "partitioned", dt=dt, steps=steps, rtol=1e-12)
+    state, _ = advance(free(), device, "cyclic_reduction", dt=dt, steps=steps, rtol=1e-12)
     host = state.model.groups[0].host
     mass = host.mass[:, 0]
     momentum = mass @ state.velocities()
@@ -303,11 +303,11 @@ def test_free_rod_balances_momentum(device):
 
 def test_failures_name_their_outcome(device):
     with pytest.raises(ddg.SolverError, match="max_iterations"):
-        advance(stiff(), device, "partitioned", max_iterations=1, retry_limit=1)
+        advance(stiff(), device, "cyclic_reduction", max_iterations=1, retry_limit=1)
     folded = straight(21)
     folded[11:, 0] = 1.0 - folded[11:, 0]
     with pytest.raises(ddg.SolverError, match=r"non_finite.*fold back by 180 degrees"):
-        advance(cantilever(21), device, "partitioned", start=folded)
+        advance(cantilever(21), device, "cyclic_reduction", start=folded)
 
 
 def test_failed_rod_leaves_others_unchanged(device):
@@ -319,14 +319,17 @@ def test_failed_rod_leaves_others_unchanged(device):
     start = points.copy()
     start[1, 11:, 0] = 1.0 - start[1, 11:, 0]
     model = scene.build(device, "float64")
-    integrator, state = ddg.Integrator(model, linear="partitioned", check_every=100), model.state(start.reshape(-1, 3))
+    integrator, state = (
+        ddg.Integrator(model, linear="cyclic_reduction", check_every=100),
+        model.state(start.reshape(-1, 3)),
+    )
     for _ in range(5):
         state = integrator.step(state, 0.01)
     with pytest.raises(ddg.SolverError, match=r"rod 1 .*non_finite"):
         integrator.check(state)
     alone = ddg.Scene()
     alone.clamp(alone.add_rod(points[0], section=ddg.Circle(0.02), material=RUBBER), edges=[0])
-    np.testing.assert_array_equal(state.points()[:21], advance(alone, device, "partitioned", steps=5)[0].points())
+    np.testing.assert_array_equal(state.points()[:21], advance(alone, device, "cyclic_reduction", steps=5)[0].points())
 
 
 def test_auto_reduces_few_long_open_rods(device):
@@ -336,7 +339,7 @@ def test_auto_reduces_few_long_open_rods(device):
         kind, where = SimpleNamespace(closed=closed), SimpleNamespace(is_cuda=cuda)
         return solver_selection.automatic(SimpleNamespace(kind=kind, device=where, nodes=nodes, columns=columns))
 
-    assert chosen(10_000, 1) == chosen(solver_selection.LONG, solver_selection.FEW) == "partitioned"
+    assert chosen(10_000, 1) == chosen(solver_selection.LONG, solver_selection.FEW) == "cyclic_reduction"
     assert (
         chosen(solver_selection.LONG - 1, 1)
         == chosen(10_000, solver_selection.FEW + 1)
@@ -347,7 +350,7 @@ def test_auto_reduces_few_long_open_rods(device):
     model = hanging().build(device)
     expected = "cyclic reduction" if model.wp_device.is_cuda else "block LDL^T sweep"
     assert expected in model.report()
-    solver = ddg.Integrator(model)._chains[0].newton
+    solver = ddg.Integrator(model)._rod_steps[0].newton
     assert isinstance(solver, RodNewtonParallel) == model.wp_device.is_cuda
 
 
@@ -360,5 +363,5 @@ def test_closed_rods_are_refused(device):
         material=RUBBER,
         closed=True,
     )
-    with pytest.raises(ddg.SceneError, match="'partitioned': rod 0 is closed"):
-        ddg.Integrator(scene.build(device), linear="partitioned")
+    with pytest.raises(ddg.SceneError, match="'cyclic_reduction': rod 0 is closed"):
+        ddg.Integrator(scene.build(device), linear="cyclic_reduction")

@@ -150,7 +150,7 @@ def test_progressive_saves_iterations_on_curled_rod(device, precision):
     """A tenth of the iterations of Gauss-Newton, which reaches its limit of 100 and needs substeps."""
     _, plain = run(helix(64, 10), device, 60, 1.0 / 120.0, precision, psd="gauss_newton")
     assert plain["outcomes"]["max_iterations"] > 0
-    for linear in ("sweep", "partitioned"):
+    for linear in ("sweep", "cyclic_reduction"):
         _, statistics = run(helix(64, 10), device, 60, 1.0 / 120.0, precision, psd="progressive", linear=linear)
         assert statistics["newton_iterations"]["mean"] < 0.2 * plain["newton_iterations"]["mean"]
         assert statistics["newton_iterations"]["max"] < 10
@@ -162,7 +162,7 @@ def test_progressive_saves_iterations_on_curled_rod(device, precision):
 def test_every_mode_has_the_same_solution(device, psd, closed):
     """Residuals stop at rtol of the load, which leaves distances far below a thousandth of the radius."""
     scene = helix(24, 1.5, closed, young=1e8)
-    linears = ("auto",) if closed else ("sweep", "partitioned")
+    linears = ("auto",) if closed else ("sweep", "cyclic_reduction")
     dt = 0.003 if closed else 0.01  # longer steps of a released ring may reach other branches
     expected, _ = run(scene, device, 5, dt, psd="gauss_newton", rtol=1e-12)
     assert np.abs(expected - scene.batches[0].points).max() > 2e-3
@@ -197,7 +197,7 @@ def test_progressive_converges_with_indefinite_hessian(device, closed, length_ra
     else:
         with pytest.raises(ddg.SolverError, match="max_iterations"):
             run(scene, device, 10, dt, start=start, rtol=1e-8, psd="gauss_newton")
-    for linear in ("sweep",) if closed else ("sweep", "partitioned"):
+    for linear in ("sweep",) if closed else ("sweep", "cyclic_reduction"):
         points, statistics = run(scene, device, 10, dt, start=start, psd="progressive", linear=linear)
         assert set(statistics["outcomes"]) <= CONVERGED | ({"indefinite"} if length_ratio < 0.9 else set()), statistics
         assert statistics["retries"] <= 4

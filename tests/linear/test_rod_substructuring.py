@@ -55,7 +55,7 @@ def dense_preconditioner(problem: Problem, world: int) -> np.ndarray:
     """Condense rod interiors, then single joints, by the formulas of `kernels.linear.rod_substructuring` with dense matrices."""
     host, free = problem.coupled.host, problem.free()
     H = np.where(np.outer(free, free), problem.matrix(world), np.diag(~free))
-    pairs = problem.newton.chains.plan.pairs
+    pairs = problem.newton.substructuring.plan.pairs
     joints = [[int(b) for b in pair if b >= 0] for pair in pairs]
     taken = {b for joint in joints for b in joint}
     interiors = [[int(b) for b in (*rod.all_nodes, *rod.all_edges) if b not in taken] for rod in host.rods]
@@ -89,7 +89,7 @@ def test_preconditioner_is_dense_condensation(device, monkeypatch, scene, reduce
     """Equal to dense condensation by the serial sweep and by cyclic reduction, with factors stored or recomputed."""
     monkeypatch.setattr(rod_substructuring, "long_and_few", lambda *_: bool(reduces))
     monkeypatch.setattr(cyclic_reduction, "LONGEST_REPEATED", 1 if reduces == "anew" else 8192)
-    problem = Problem(scene(), device, 1.02, preconditioner="chain")
+    problem = Problem(scene(), device, 1.02, preconditioner="substructuring")
     problem.newton.islands.drop_compression.fill_(1)
     problem.iterate(0.1)
     vectors = np.random.default_rng(1).normal(size=(3, 2, 3 * problem.blocks)) * problem.free()
@@ -101,8 +101,8 @@ def test_preconditioner_is_dense_condensation(device, monkeypatch, scene, reduce
 
 def test_joints_are_shared_nodes_and_ring_closures(device):
     """Joints are shared nodes, rotations of rigid joints, and the last two nodes of a ring, which couple to its first."""
-    problem = Problem(ring_and_spokes(), device, preconditioner="chain")
-    plan, host = problem.newton.chains.plan, problem.coupled.host
+    problem = Problem(ring_and_spokes(), device, preconditioner="substructuring")
+    plan, host = problem.newton.substructuring.plan, problem.coupled.host
     ring, one, two, cable = host.rods
     assert {tuple(pair) for pair in plan.pairs} == {
         (ring.nodes[2], host.nodes + host.angles),
@@ -128,7 +128,7 @@ def indefinite(problem: Problem) -> bool:
     return np.linalg.eigvalsh(problem.matrix(0)[np.ix_(free, free)])[0] < 0.0
 
 
-@pytest.mark.parametrize("preconditioner", ["chain", "chain_multilevel"])
+@pytest.mark.parametrize("preconditioner", ["substructuring", "substructuring_multilevel"])
 @pytest.mark.parametrize(
     ("scene", "stretch"),
     [(frame_and_sheet, 1.02), (frame_and_sheet, 0.8), (hinged_grid, 1.02)],
@@ -184,11 +184,11 @@ def rod_on_a_fixed_sheet() -> ddg.Scene:
 @pytest.mark.parametrize("scene", [bent_frame, star, rod_on_a_fixed_sheet])
 def test_systems_with_at_most_one_joint_need_no_pcg(device, scene, precision):
     """Substructuring alone solves H d = r, without PCG iterations."""
-    problem = Problem(scene(), device, 1.02, precision, "chain")
+    problem = Problem(scene(), device, 1.02, precision, "substructuring")
     problem.newton.islands.drop_compression.fill_(1)
     matrices, newton, free = [problem.assemble().matrix(world) for world in range(2)], problem.newton, problem.free()
     newton.direct()
-    assert newton.chains.exact and newton.pcg_iterations() == 0
+    assert newton.substructuring.exact and newton.pcg_iterations() == 0
     rhs, direction = (v.numpy().astype(float).reshape(2, -1) for v in (newton.system.rhs, newton.system.direction))
     for world in range(2):
         expected = np.zeros(free.size)
@@ -200,12 +200,12 @@ def test_systems_with_at_most_one_joint_need_no_pcg(device, scene, precision):
 @pytest.mark.parametrize("scene", [bent_frame, star])
 def test_elimination_detects_indefinite_matrices(device, scene):
     """Compressed to 0.7 of the length, the iterate is repeated without compression, with a definite matrix."""
-    problem = Problem(scene(), device, 0.7, preconditioner="chain")
+    problem = Problem(scene(), device, 0.7, preconditioner="substructuring")
     islands = problem.newton.islands
     islands.inertia_coefficient.fill_(1e-3)
     islands.iteration.fill_(1)
     problem.iterate(0.1)
-    assert problem.newton.chains.exact
+    assert problem.newton.substructuring.exact
     assert islands.drop_compression.numpy().tolist() == [1, 1]
     assert islands.iteration.numpy().tolist() == islands.needs_direction.numpy().tolist() == [0, 0]
     islands.needs_direction.fill_(1)
@@ -220,13 +220,13 @@ def test_iterations_are_independent_of_nodes_per_rod(device, rigid, precision):
     """Iterations stay at 5 or 6 from 5 to 15 edges between crossings, where block Jacobi takes 55 and 250."""
     iterations = {}
     for segments in (5, 15):
-        for linear in ("block_jacobi", "chain"):
+        for linear in ("block_jacobi", "substructuring"):
             scene = gridshell_dome.build(3, segments, rigid=rigid)
-            problem = Problem(scene, device, 1.0, precision, linear, noise=0.0)
+            problem = Problem(scene, device, 1.0, precision, linear, rounding_error=0.0)
             problem.newton.islands.inertia_coefficient.fill_(3600.0)
             iterations[linear, segments] = pcg_iterations(problem, 1e-3).max()
-    assert iterations["chain", 15] <= iterations["chain", 5] + 2 <= 10
-    assert iterations["chain", 15] < 0.1 * iterations["block_jacobi", 15]
+    assert iterations["substructuring", 15] <= iterations["substructuring", 5] + 2 <= 10
+    assert iterations["substructuring", 15] < 0.1 * iterations["block_jacobi", 15]
     assert iterations["block_jacobi", 15] > 2 * iterations["block_jacobi", 5]
 
 
@@ -244,12 +244,12 @@ def trajectory(scene, device, linear: str, dt: float, precision="float64", world
 def test_gridshell_steps_match_block_jacobi(device, precision):
     scene = gridshell_dome.build(3, 8)
     expected, many = trajectory(scene, device, "block_jacobi", 1.0 / 60.0, precision)
-    points, few = trajectory(scene, device, "chain", 1.0 / 60.0, precision)
+    points, few = trajectory(scene, device, "substructuring", 1.0 / 60.0, precision)
     moved = np.abs(expected - scene.build("cpu", "float64", worlds=2).state().points()).max()
     np.testing.assert_allclose(points, expected, rtol=0.0, atol=1e-5 * moved)
     np.testing.assert_array_equal(points[0], points[1])
     assert few < 0.2 * many
-    again, _ = trajectory(scene, device, "chain", 1.0 / 60.0, precision)
+    again, _ = trajectory(scene, device, "substructuring", 1.0 / 60.0, precision)
     np.testing.assert_array_equal(again, points)
 
 
@@ -272,7 +272,7 @@ def stiffened(spin: str, cells: int = 16) -> ddg.Scene:
 @pytest.mark.parametrize("spin", ["free", "glued"])
 def test_preconditioners_save_iterations_on_stiffened_sheet(device, spin):
     """Substructuring condenses bending and twist of the ribs; hat functions couple ribs and sheet at all lengths."""
-    most = {"multilevel": 0.5, "chain": 0.25, "chain_multilevel": 0.23}
+    most = {"multilevel": 0.5, "substructuring": 0.25, "substructuring_multilevel": 0.23}
     points, many = trajectory(stiffened(spin), device, "block_jacobi", 1.0 / 60.0, worlds=1)
     for linear, ratio in most.items():
         result, few = trajectory(stiffened(spin), device, linear, 1.0 / 60.0, worlds=1)
@@ -282,11 +282,11 @@ def test_preconditioners_save_iterations_on_stiffened_sheet(device, spin):
 
 def test_preconditioner_choice_by_nodes_between_joints(device):
     """The choice follows the number of nodes between joints; systems without rods launch no substructuring."""
-    assert coupled_preconditioner(gridshell_dome.build(3, 12).build(device).coupled) == "chain"
+    assert coupled_preconditioner(gridshell_dome.build(3, 12).build(device).coupled) == "substructuring"
     assert coupled_preconditioner(gridshell_dome.build(3, 2).build(device).coupled) == "block_jacobi"
     assert coupled_preconditioner(sheet("hinge").build(device).coupled) == "block_jacobi"
     points, triangles = meshes.rectangle(70, 70, (1.0, 1.0), "alternating")
-    for rods, name in ((0, "multilevel"), (1, "chain_multilevel")):
+    for rods, name in ((0, "multilevel"), (1, "substructuring_multilevel")):
         scene = ddg.Scene()
         shell = scene.add_shell(points, triangles, thickness=0.01, material=STEEL, bending="hinge")
         for _ in range(rods):
@@ -295,11 +295,11 @@ def test_preconditioner_choice_by_nodes_between_joints(device):
         assert coupled_preconditioner(scene.build(device).coupled) == name
 
 
-@pytest.mark.parametrize("linear", ["block_jacobi", "chain"])
+@pytest.mark.parametrize("linear", ["block_jacobi", "substructuring"])
 def test_kernels_load_only_for_substructuring(device, linear):
     newton = Problem(bent_frame(), device, preconditioner=linear).newton
     keys = [(entry[0] if isinstance(entry, tuple) else entry).key for entry in newton.kernels]
-    assert any("chain_kernels" in key or "joint_kernels" in key for key in keys) == (linear == "chain")
+    assert any("chain_kernels" in key or "joint_kernels" in key for key in keys) == (linear == "substructuring")
 
 
 def truss() -> ddg.Scene:
@@ -314,9 +314,9 @@ def truss() -> ddg.Scene:
 @pytest.mark.parametrize(
     ("scene", "linear", "message"),
     [
-        (lambda: sheet("hinge"), "chain", "coupled systems with rods; this one has none"),
-        (truss, "chain", "no rod of the coupled system has a node between its joints"),
-        (bent_frame, "chains", "block_jacobi or chain or multilevel or chain_multilevel"),
+        (lambda: sheet("hinge"), "substructuring", "coupled systems with rods; this one has none"),
+        (truss, "substructuring", "no rod of the coupled system has a node between its joints"),
+        (bent_frame, "chains", "block_jacobi or substructuring or multilevel or substructuring_multilevel"),
     ],
     ids=["sheet", "truss", "name"],
 )
@@ -330,7 +330,7 @@ def test_systems_without_rod_interiors_are_refused(device, scene, linear, messag
 def test_assembly_along_rods_matches_incidence_lists(device, scene, psd):
     """Residuals, rounding bounds, energy changes and H on free dofs agree between the two forms of rod elements."""
     results = []
-    for preconditioner in ("block_jacobi", "chain"):
+    for preconditioner in ("block_jacobi", "substructuring"):
         problem = Problem(scene(), device, 1.02, preconditioner=preconditioner, psd=psd)
         newton, islands = problem.newton, problem.newton.islands
         random = np.random.default_rng(5)
@@ -347,13 +347,13 @@ def test_assembly_along_rods_matches_incidence_lists(device, scene, psd):
             newton.tolerances.ratio,
             newton.norms.square,
             newton.norms.change,
-            newton.norms.noise,
+            newton.norms.rounding_error,
         )
         results.append([*(v.numpy().astype(float) for v in vectors)])
         results[-1] += [problem.matrix(world)[np.ix_(free, free)] for world in range(2)]
         flags = islands.not_converged.numpy().tolist(), islands.below_rounding_floor.numpy().tolist()
         assert flags == ([1, 1], [1, 1])
-    assert problem.newton.chains.banded and any(problem.newton.elements.local)
+    assert problem.newton.substructuring.banded and any(problem.newton.elements.local)
     for by_lists, by_dof_map in zip(*results, strict=True):
         assert np.abs(by_lists).max() > 0.0
         np.testing.assert_allclose(by_dof_map, by_lists, rtol=1e-11, atol=1e-12 * np.abs(by_lists).max())

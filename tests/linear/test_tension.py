@@ -58,11 +58,11 @@ def directions(
     random, results = np.random.default_rng(11), []
     model = scene.build(device, "float64")
     for group, state in zip(model.groups, model.state().groups, strict=True):
-        newton = DIRECT[solver](model, group, NewtonOptions(psd=psd), linear, split=carried is not None)
+        newton = DIRECT[solver](model, group, NewtonOptions(psd=psd), linear, mixed_axial=carried is not None)
         x = device_arrays.download(state.x)
-        noise = 1e-3 * random.normal(size=x.shape)
+        rounding_error = 1e-3 * random.normal(size=x.shape)
         mask = (device_arrays.download(group.fixed)[..., None] >> np.arange(group.kind.dim)) & 1
-        iterate = x + noise * (mask == 0)
+        iterate = x + rounding_error * (mask == 0)
         if kept:
             edges = np.diff(iterate, axis=0)
             size = np.linalg.norm(np.diff(x, axis=0), axis=-1, keepdims=True)
@@ -97,7 +97,7 @@ def error(direction: np.ndarray, exact: np.ndarray) -> float:
     ("psd", "solver"),
     [
         ("gauss_newton", "sweep"),
-        ("gauss_newton", "partitioned"),
+        ("gauss_newton", "cyclic_reduction"),
         pytest.param("none", "sweep", marks=pytest.mark.slow),  # refused by cyclic reduction
     ],
 )
@@ -127,8 +127,8 @@ def test_float32_error_is_independent_of_axial_stiffness(device, solver):
     for axial in (1e2, 1e4, 1e6, 1e8):
         scene = rods("twist", axial, "root")
         exact = directions(scene, device, wp.float64, None, kept=True)
-        for split, error_list in errors.items():
-            inexact = directions(scene, device, wp.float32, 1e2 if split else None, kept=True, solver=solver)
+        for mixed_axial, error_list in errors.items():
+            inexact = directions(scene, device, wp.float32, 1e2 if mixed_axial else None, kept=True, solver=solver)
             error_list.append(max(error(a[: b.shape[0]], b) for (a, *_), (b, *_) in zip(inexact, exact, strict=True)))
     assert max(errors[True]) < 1e-3
     assert errors[False][-1] > 1e2 * errors[True][-1]
@@ -146,7 +146,7 @@ def mixed_wavy_rod(nodes: int, axial: float, device) -> RodNewtonParallel:
     scene.fix(rod, [72], components="y")
     model = scene.build(device, "mixed")
     group, state = model.groups[0], model.state().groups[0]
-    newton = RodNewtonParallel(model, group, NewtonOptions(), split=True)
+    newton = RodNewtonParallel(model, group, NewtonOptions(), mixed_axial=True)
     for array in (newton.x, newton.target):
         wp.copy(array, state.x)
     wp.copy(newton.frame, state.frame)
@@ -246,7 +246,7 @@ def test_long_cable_matches_float64(device):
             points, section=ddg.Circle(1e-3), material=ddg.Material(young=2e11, poisson=0.3, density=7800.0)
         )
         scene.clamp(rod, edges=[0, 638])
-        runs[precision] = advance(scene, device, precision, 1.0 / 240.0, 60, linear="partitioned")
+        runs[precision] = advance(scene, device, precision, 1.0 / 240.0, 60, linear="cyclic_reduction")
     (exact, one), (x, two) = runs["float64"], runs["mixed"]
     assert two["linear"] == ["float32 with tensions"]
     assert np.abs(exact - points).max() > 0.05

@@ -483,7 +483,7 @@ def test_invalid_inputs_are_refused(parameters, controls, message):
         sim.step(sim.initial_state(2), parameters, controls)
 
 
-@covering(1, solver=("sweep", "partitioned"), case=((1e7, 0.02, 1), (1e9, 0.02, 2), (1e11, 0.002, 0)))
+@covering(1, solver=("sweep", "cyclic_reduction"), case=((1e7, 0.02, 1), (1e9, 0.02, 2), (1e11, 0.002, 0)))
 def test_float32_solves_for_the_noninertial_gradient(monkeypatch, case, solver):
     """Gradients agree within the error of the solutions.
 
@@ -504,7 +504,7 @@ def test_float32_solves_for_the_noninertial_gradient(monkeypatch, case, solver):
         thrown.requires_grad_()
         *_, state = sim.rollout(sim.initial_state(velocities=thrown), steps=20)
         gradients.append(torch.autograd.grad(((state.positions - rest.positions) ** 2).sum(), thrown)[0].cpu().numpy())
-    assert sim.engine(1).adjoint.chains[0].solve.system.passes == passes
+    assert sim.engine(1).adjoint.rod_adjoints[0].solve.system.passes == passes
     exact, result = gradients
     bound = sim.model.groups[0].float32_errors(0.005).max() ** passes
     assert bound < 1e-5 or not passes

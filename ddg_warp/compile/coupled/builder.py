@@ -192,7 +192,7 @@ class _Builder:
         boundary_conditions.add_masses(scene, coupled)
         boundary_conditions.hold(scene, coupled)
         boundary_conditions.load(scene, coupled)
-        coupled.touching = contact_parameters(scene, coupled)
+        coupled.contact_parameters = contact_parameters(scene, coupled)
         if scene.dimension == 2:
             coupled.fixed[:nodes, 1] = True
             coupled.fixed[nodes : nodes + angles] = True

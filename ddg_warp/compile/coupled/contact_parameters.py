@@ -21,7 +21,7 @@ INERTIA = 10.0  # least contact stiffness after a step ended at the minimum gap,
 
 def contact_parameters(scene, coupled: CoupledSystem) -> ContactParameters | None:
     """Return the contact of the coupled system, None without."""
-    law = scene.touching
+    law = scene.contact_parameters
     if law is None:
         return None
     names, bodies, forces, sections = contact_names(scene), [], [], {}
@@ -76,10 +76,10 @@ def _radii_and_forces(batch, radius: float | None) -> tuple[list[float], list[fl
     Raises:
         SceneError: the section has no positive radius.
     """
-    own = batch.section.radius
-    if radius is None and (own is None or not np.all(np.asarray(own) > 0.0)):
+    section_radius = batch.section.radius
+    if radius is None and (section_radius is None or not np.all(np.asarray(section_radius) > 0.0)):
         raise SceneError(
-            f"contact: rod {batch.first} ('{batch.name}') needs a contact radius, and its section has {own}; give "
+            f"contact: rod {batch.first} ('{batch.name}') needs a contact radius, and its section has {section_radius}; give "
             f"Stiffness(radius=...), positive, or contact(radius={{{batch.name!r}: ...}})"
         )
     radii = _largest(batch, "radius") if radius is None else np.full(batch.rods, radius)
@@ -118,10 +118,20 @@ def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: n
     explicit = bool(np.isfinite(stiffness).any())
     inertia = np.where(np.isnan(stiffness), inertia, 0.0)
     stiffness = np.where(np.isnan(stiffness), force / within, stiffness)
-    density, keep = contact_law(law, stiffness, within, explicit)
+    density, min_separation_fraction = contact_law(law, stiffness, within, explicit)
     multipliers = _by_direction(rough)
     return ContactParameters(
-        law, density, keep, bodies, names.tolist(), group, *multipliers, stiffness, within, inertia, ignored
+        law,
+        density,
+        min_separation_fraction,
+        bodies,
+        names.tolist(),
+        group,
+        *multipliers,
+        stiffness,
+        within,
+        inertia,
+        ignored,
     )
 
 

@@ -97,7 +97,7 @@ class CoupledSystem(DofStorage):
         mass: of every dof (N, 3) [kg, kg m^2]; fixed: mask of fixed dofs (N, 3).
         obstacles: nodes of each obstacle, all fixed.
         markers: carried nodes of each rotating surface, at one radius from its first node along x, y and z at rest.
-        touching: contact, None without.
+        contact_parameters: contact, None without.
         frames: nodal frames, orthonormal rows (3, 3), of nodes on skew supports, by node; see `compile.coupled.skew_supports`.
     """
 
@@ -116,7 +116,7 @@ class CoupledSystem(DofStorage):
     meridians: list[axisymmetric.CoupledMeridian] = field(default_factory=list)
     obstacles: list[np.ndarray] = field(default_factory=list)
     markers: list[np.ndarray] = field(default_factory=list)
-    touching: ContactParameters | None = None
+    contact_parameters: ContactParameters | None = None
     frames: dict[int, np.ndarray] = field(default_factory=dict)
 
     @property

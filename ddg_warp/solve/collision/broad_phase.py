@@ -26,9 +26,9 @@ MORE = 16  # counters of other objects that are read in the same transfer
 class BroadPhase:
     """Candidates: pairs of `shapes` that may come within range, in each of some worlds.
 
-    All pairs within thickness + `reach` are candidates while every node is within half of `margin` of its position at the search.
-    After a search for a motion, the path replaces the position. Each node may be anywhere along its path, the nodes of a half-space
-    alike. In a world with a single step fraction, all nodes are at that fraction.
+    All pairs within thickness + `search_distance` are candidates while every node is within half of `margin` of its position at the
+    search. After a search for a motion, the path replaces the position. Each node may be anywhere along its path, the nodes of a
+    half-space alike. In a world with a single step fraction, all nodes are at that fraction.
 
     `update`, `filter`, `measure`, `impact` and `crossings` read nothing back and can be captured; `update`, `filter` and `search`
     also in conditional graph nodes. `rebuild` can be captured, on CUDA outside of conditional nodes only. There it should begin a
@@ -38,7 +38,7 @@ class BroadPhase:
     Args:
         shapes: collision mesh of one world.
         x: positions (worlds times nodes,), vectors of 3 [m], world by world.
-        reach: search distance: largest gap of interest [m], positive.
+        search_distance: search distance: largest gap of interest [m], positive.
         margin: skin margin added to the search distance [m], positive. Large ones give more pairs, small ones more searches.
         radius: radius of every object in every world (worlds, objects) [m], in place of the radii of `shapes`.
 
@@ -65,11 +65,11 @@ class BroadPhase:
         x: wp.array,
         worlds: int = 1,
         *,
-        reach: float,
+        search_distance: float,
         margin: float,
         radius: wp.array | None = None,
     ):
-        for name, value in (("reach", reach), ("margin", margin)):
+        for name, value in (("reach", search_distance), ("margin", margin)):
             if not 0.0 < value < np.inf:
                 raise SceneError(f"{name} = {value!r} of a contact search; it is positive and finite [m]")
         nodes = len(shapes.points)
@@ -77,18 +77,23 @@ class BroadPhase:
             raise SceneError(
                 f"positions of {worlds} world(s) of {nodes} nodes are {worlds * nodes} vectors of 3, not {x.shape} of {x.dtype}"
             )
-        self.shapes, self.worlds, self.reach, self.margin = shapes, worlds, float(reach), float(margin)
+        self.shapes, self.worlds, self.search_distance, self.margin = (
+            shapes,
+            worlds,
+            float(search_distance),
+            float(margin),
+        )
         self.device, real = x.device, x.dtype._wp_scalar_type_
         self.real = real
         if radius is None:
             radius = wp.array(np.tile(shapes.radii, (worlds, 1)), dtype=real, device=self.device)
         primitives = {size: Primitives(shapes, size, worlds, real, self.device, radius) for size in shapes.sizes}
-        self._things = list(primitives.values())
+        self._primitives = list(primitives.values())
         self._still, self._move, self._way = (wp.zeros(len(x), dtype=x.dtype, device=self.device) for _ in range(3))
         self._start, self._end = (wp.zeros_like(x) for _ in range(2))  # motion of the last search
         used = np.zeros(nodes, np.uint8)  # nodes of no primitive may be no positions, as edge blocks
         for size in shapes.sizes:
-            used[shapes.things(size)[0]] = 1
+            used[shapes.primitives(size)[0]] = 1
         self._placed = wp.array(used, dtype=wp.uint8, device=self.device)
         self._shift = wp.zeros(worlds, dtype=x.dtype, device=self.device)
         self._never, self.every = (wp.full(worlds, flag, dtype=int, device=self.device) for flag in (0, 1))
@@ -102,7 +107,7 @@ class BroadPhase:
         # candidates outdated, outdated for the check of a whole step, searched by the last `update`
         self._stale, self._beyond, self._done = (wp.zeros(1, dtype=int, device=self.device) for _ in range(3))
         self._edges = primitives[2]
-        self._walked = [part for part in self._things if part.walked]
+        self._walked = [part for part in self._primitives if part.walked]
         self._motion = motion_kernels(real, device_arrays.serial(self.device))
         self.rebuild(x)
         several_worlds = worlds > 1
@@ -131,7 +136,7 @@ class BroadPhase:
     def kernels(self) -> list:
         """Kernels to load before a capture of a step, which has no `impact`."""
         lists = [kernel for pairs in self.lists for kernel in pairs.kernels]
-        boxes = [kernel for part in self._things for kernel in part.kernels]
+        boxes = [kernel for part in self._primitives for kernel in part.kernels]
         return [*lists, *boxes, *self._motion, *self._passes, *self._filter.kernels]
 
     @property
@@ -149,7 +154,7 @@ class BroadPhase:
         After large motions, a search in an old tree takes tens of times as long.
         """
         self._enclose(x, self._still, self._never, 1.0, self._within)
-        for primitives in self._things:
+        for primitives in self._primitives:
             primitives.build()
 
     def update(self, base: wp.array, q: wp.array | None = None, together: wp.array | None = None) -> None:
@@ -186,7 +191,7 @@ class BroadPhase:
 
         def find(pairs: CandidateList) -> None:
             pairs.meet()
-            pairs.judge(x, move, together, self.reach, self._around)
+            pairs.narrow_phase(x, move, together, self.search_distance, self._around)
 
         device_arrays.side_by_side([partial(find, pairs) for pairs in self.lists], self.device)
         _, _, mark, _ = self._motion
@@ -200,27 +205,43 @@ class BroadPhase:
         self._sweep(watch, base, inputs, [self._move, stale])
 
     def filter(
-        self, base: wp.array, q: wp.array, unit: wp.array, together: wp.array, units: int, keep: float = 1.0
+        self,
+        base: wp.array,
+        q: wp.array,
+        ccd_body: wp.array,
+        together: wp.array,
+        num_ccd_bodies: int,
+        min_separation_fraction: float = 1.0,
     ) -> None:
-        """Limit the motion from `base` to `q` in place so that all pairs keep the fraction `keep` of the thickness.
+        """Limit the motion from `base` to `q` in place so that all pairs keep the fraction `min_separation_fraction` of the thickness.
 
         Each CCD body moves by its own step fraction, in `shares`; `time` has the smallest of each world. Common motion of all nodes
         limits nothing. Candidates are updated. After a capacity overflow nothing moves.
 
         Args:
-            unit: CCD body of each node of a world (nodes,); -1 for nodes that are never limited. If such a node belongs to a moving
+            ccd_body: CCD body of each node of a world (nodes,); -1 for nodes that are never limited. If such a node belongs to a moving
                 object, others may not evade it.
             together: (worlds,), nonzero where all CCD bodies have one step fraction.
-            units: number of CCD bodies of a world.
+            num_ccd_bodies: number of CCD bodies of a world.
 
         Raises:
             SceneError: not 0 <= keep <= 1, or arrays are invalid.
         """
-        _checked_keep(keep)
-        self._filter.check(unit, together, units)
+        _checked_keep(min_separation_fraction)
+        self._filter.check(ccd_body, together, num_ccd_bodies)
         self.update(base, q, together)
         search = (self.overflow, self.time, self._done, self._start, self._end)
-        self._filter(base, self._move, q, unit, together, units, keep, self._room(keep), search)
+        self._filter(
+            base,
+            self._move,
+            q,
+            ccd_body,
+            together,
+            num_ccd_bodies,
+            min_separation_fraction,
+            self._room(min_separation_fraction),
+            search,
+        )
 
     def fit(self, x: wp.array, shorten: Callable[[], bool] | None = None) -> bool:
         """Grow overflowed lists and search again until all pairs fit; return True if any overflowed. Reads from the device.
@@ -267,22 +288,28 @@ class BroadPhase:
         return overflow != 0
 
     def measure(self, x: wp.array, enough: float = -math.inf) -> None:
-        """Write the smallest gap of each world to `gap` [m], at most `reach`, or any below `enough`. Needs valid candidates."""
-        self.gap.fill_(self.reach)
+        """Write the smallest gap of each world to `gap` [m], at most `search_distance`, or any below `enough`.
+
+        Needs valid candidates.
+        """
+        self.gap.fill_(self.search_distance)
         for pairs in self.lists:
             pairs.measure(x, self.gap, enough)
 
-    def impact(self, x: wp.array, move: wp.array, keep: float = 1.0) -> None:
-        """Write the first time in the motion from x by `move` when a pair is as near as `keep` of the thickness, by world to `time`.
+    def impact(self, x: wp.array, move: wp.array, min_separation_fraction: float = 1.0) -> None:
+        """Write the first time in the motion from x by `move` when a pair is as near as `min_separation_fraction` of the thickness,
+        by world to `time`.
 
         The time is conservative, 1 without such a pair and 0 if some overlap at x. All pairs are tested, not only candidates.
 
         Raises:
             SceneError: not 0 <= keep <= 1.
         """
-        _checked_keep(keep)
+        _checked_keep(min_separation_fraction)
         self.time.fill_(1.0)
-        self._passing(self._impacts, x, move, keep, self._unused[1], [self._unused[2]] * len(self.lists))
+        self._passing(
+            self._impacts, x, move, min_separation_fraction, self._unused[1], [self._unused[2]] * len(self.lists)
+        )
 
     def crossings(self, x: wp.array, move: wp.array) -> None:
         """Count interpenetrating pairs, without thickness, in the straight motion from x by `move`, by world in `crossed`."""
@@ -297,14 +324,14 @@ class BroadPhase:
         self._watch(base, q, self._beyond)
         wp.capture_if(self._beyond, lambda: self.crossings(base, self._move), lambda: self.passing(base))
 
-    def passing(self, base: wp.array, keep: float = 0.0) -> None:
+    def passing(self, base: wp.array, min_separation_fraction: float = 0.0) -> None:
         """Count interpenetrating candidates, which have to be valid, in the present motion from `base`.
 
-        With `keep`, count pairs that come within that fraction of their thickness, or slightly farther.
+        With `min_separation_fraction`, count pairs that come within that fraction of their thickness, or slightly farther.
         """
         self.crossed.zero_()
         for pairs in self.lists:
-            pairs.cross(base, self._move, self.crossed, keep, self.reach)
+            pairs.cross(base, self._move, self.crossed, min_separation_fraction, self.search_distance)
 
     def first_crossing(self) -> str:
         """Return the names of the first interpenetrating pair, or nothing. Reads from the device."""
@@ -331,19 +358,26 @@ class BroadPhase:
     @property
     def _within(self) -> float:
         """Inflation of AABBs: half of the gap up to which boxes overlap."""
-        return 0.5 * self.reach + self._around
+        return 0.5 * self.search_distance + self._around
 
-    def _passing(self, kernels, x, move, keep: float, number, firsts) -> None:
-        self._enclose(x, move, self.every, keep, 0.0)
+    def _passing(self, kernels, x, move, min_separation_fraction: float, number, firsts) -> None:
+        self._enclose(x, move, self.every, min_separation_fraction, 0.0)
         for primitives in self._walked:
             primitives.leaves.tree.refit()
         for kernel, pairs, first in zip(kernels, self.lists, firsts, strict=True):
             pairs.meet()
-            pairs.impact(kernel, x, move, keep, self._room(keep), [self.time, number, first])
+            pairs.impact(
+                kernel,
+                x,
+                move,
+                min_separation_fraction,
+                self._room(min_separation_fraction),
+                [self.time, number, first],
+            )
 
-    def _room(self, keep: float) -> float:
+    def _room(self, min_separation_fraction: float) -> float:
         """Return the search distance, within which gaps close step by step; 0 if gaps may close."""
-        return self.reach if keep > 0.0 else 0.0
+        return self.search_distance if min_separation_fraction > 0.0 else 0.0
 
     def _find_common(self, move, together) -> None:
         *_, common = self._motion
@@ -352,13 +386,13 @@ class BroadPhase:
 
     def _enclose(self, x, move, together, radius_fraction: float, margin: float) -> None:
         self._find_common(move, together)
-        for primitives in self._things:
+        for primitives in self._primitives:
             primitives.enclose(x, move, self._shift, radius_fraction, margin, self._lost)
 
     def _sweep(self, kernel, x, inputs: list, outputs: list) -> None:
         device_arrays.sweep(kernel, len(x), inputs, outputs, self.device)
 
 
-def _checked_keep(keep: float) -> None:
-    if not 0.0 <= keep <= 1.0:
-        raise SceneError(f"keep = {keep!r} of the thickness; it is from 0 to 1")
+def _checked_keep(min_separation_fraction: float) -> None:
+    if not 0.0 <= min_separation_fraction <= 1.0:
+        raise SceneError(f"min_separation_fraction = {min_separation_fraction!r} of the thickness; it is from 0 to 1")

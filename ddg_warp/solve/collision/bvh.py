@@ -93,7 +93,7 @@ class Primitives:
     """
 
     def __init__(self, shapes, size: int, worlds: int, real, device, radius: wp.array):
-        nodes, _, owner, span = shapes.things(size)
+        nodes, _, owner, span = shapes.primitives(size)
         self.size, self.count, self.all, self.device = size, len(nodes), worlds * len(nodes), device
         if self.all >= 2**31:
             raise SceneError(

@@ -163,19 +163,30 @@ class CandidateList:
         outputs = [self._found, self._met]
         wp.launch(self._meet, self.first.leaves.all, [self.trees], outputs, device=self.device)
 
-    def judge(self, x, move, together, reach: float, around: float) -> None:
+    def narrow_phase(self, x, move, together, search_distance: float, around: float) -> None:
         """Narrow phase: list overlapping primitives that are in range, or may be during the motion."""
         lists, room = [self._links, self._last], [self.overflow, self._needed]
         self.partners.zero_()
-        inputs = [self.sides, self.trees, self._wide, x, move, together, reach, around, self._found, self._met]
+        inputs = [
+            self.sides,
+            self.trees,
+            self._wide,
+            x,
+            move,
+            together,
+            search_distance,
+            around,
+            self._found,
+            self._met,
+        ]
         device_arrays.take_turns(self._judge, len(self._met), inputs, [*lists, self.partners, *room], self.device)
         self._sums()
         inputs = [*lists, self.starts, self.partners]
         wp.launch(self._fill, self.first.all, inputs, [self.pairs, self.count, *room], device=self.device)
 
-    def impact(self, kernel, x, move, keep: float, room: float, outputs: list) -> None:
+    def impact(self, kernel, x, move, min_separation_fraction: float, room: float, outputs: list) -> None:
         """Launch a kernel of `kernels.collision.ccd.additive_ccd` on the pairs with overlapping swept AABBs."""
-        inputs = [self.sides, self.trees, self._found, self._met, x, move, keep, room]
+        inputs = [self.sides, self.trees, self._found, self._met, x, move, min_separation_fraction, room]
         outputs = [*outputs, self.overflow, self._needed]
         device_arrays.take_turns(kernel, len(self._met), inputs, outputs, self.device)
 
@@ -184,7 +195,7 @@ class CandidateList:
         inputs = [self.pairs, self.count, self.sides, x, enough]
         device_arrays.take_turns(self._gaps, self.capacity, inputs, [gap], self.device)
 
-    def cross(self, x, move, crossed, keep: float = 0.0, reach: float = 0.0) -> None:
-        """Count pairs by world that interpenetrate in the motion from x, or come within `keep` of the thickness."""
-        inputs = [self.pairs, self.count, self.sides, x, move, keep, reach]
+    def cross(self, x, move, crossed, min_separation_fraction: float = 0.0, search_distance: float = 0.0) -> None:
+        """Count pairs by world that interpenetrate in the motion from x, or come within `min_separation_fraction` of the thickness."""
+        inputs = [self.pairs, self.count, self.sides, x, move, min_separation_fraction, search_distance]
         device_arrays.take_turns(self._passing, self.capacity, inputs, [crossed], self.device)

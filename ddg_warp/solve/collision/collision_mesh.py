@@ -179,7 +179,7 @@ class CollisionMesh:
             *[PLANES] * bool(primitives[PLANES]),
         ]
 
-    def things(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def primitives(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return nodes, radius, object (n,) and span (n, 4) of the primitives of a size: number of nodes, `BALLS` or `PLANES`.
 
         Raises:
@@ -194,10 +194,10 @@ class CollisionMesh:
 
     def beside(self, size: int) -> np.ndarray:
         """Return both nodes of edges; for points on rods the previous and next node, for others the node itself (n, 2)."""
-        nodes, _, owner, _ = self.things(size)
+        nodes, _, owner, _ = self.primitives(size)
         if size == 2:
             return nodes
-        ends, _, owners, _ = self.things(2)
+        ends, _, owners, _ = self.primitives(2)
         node_keys, result = owner * len(self.points) + nodes[:, 0], np.repeat(nodes, 2, axis=1)
         for side in range(2):
             keys = owners * len(self.points) + ends[:, 1 - side]
@@ -208,7 +208,7 @@ class CollisionMesh:
 
     def angles(self, size: int) -> np.ndarray:
         """Return the angle blocks (n, 2) of edges, or of the edges before and after points on rods; -1 for none."""
-        nodes, _, owner, _ = self.things(size)
+        nodes, _, owner, _ = self.primitives(size)
         result = np.full((len(nodes), 2), -1)
         for number, angles in self._angles.items():
             rows = np.flatnonzero(owner == number)

@@ -15,7 +15,7 @@ class ContactBlocks:
 
     Attributes:
         diagonal: (worlds times nodes,) blocks at nodes, 3 x 3 [N/m]; stiffness: (worlds times nodes,) their traces [N/m].
-        between: (worlds times edges,) blocks between the first and the second node of edges, in the order of `shapes.things(2)`. A
+        between: (worlds times edges,) blocks between the first and the second node of edges, in the order of `shapes.primitives(2)`. A
             pair contributes the 6 x 6 block of each of its edges to both, positive semi-definite. See `join`.
         `turned`: for rolling, blocks of each edge angle with the first and second node [N], and with the angle of the next edge
             of the rod [N m]. Diagonal blocks of angles are in `diagonal`.
@@ -29,7 +29,7 @@ class ContactBlocks:
             return wp.zeros(count, dtype=dtype, device=search.device)
 
         self.diagonal, self.stiffness, self.between = make(nodes, block), make(nodes, search.real), make(edges, block)
-        self._told, self._told_edges = make(nodes, wp.uint8), make(edges, wp.uint8)
+        self._has_force, self._has_edge_force = make(nodes, wp.uint8), make(edges, wp.uint8)
         types = (*(wp.types.vector(3, linear),) * 2, linear)
         self.turned = [make(edges if rolls else 0, dtype) for dtype in types]
         angles = search.shapes.angles(2)[:, 0].astype(np.int32)
@@ -40,13 +40,13 @@ class ContactBlocks:
 
     def collect(self, sets: wp.array, forces: wp.array) -> None:
         """Write the forces of all sets of pairs, `diagonal` and `stiffness`."""
-        outputs = [forces, self.diagonal, self.stiffness, self._told]
+        outputs = [forces, self.diagonal, self.stiffness, self._has_force]
         device_arrays.sweep(self._collect, len(forces), [sets], outputs, self._device)
 
     def join(self, sets: wp.array) -> None:
         """Write `between` and `turned` of the last evaluation."""
         edges = self._edges
-        inputs, outputs = [sets, edges.surface, edges.count], [self.between, self._told_edges]
+        inputs, outputs = [sets, edges.surface, edges.count], [self.between, self._has_edge_force]
         device_arrays.sweep(self._join, len(self.between), inputs, outputs, self._device)
         if len(self.kernels) > 2:
             inputs = [sets, self._angles, self._nodes]

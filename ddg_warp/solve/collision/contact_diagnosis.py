@@ -27,9 +27,9 @@ class ContactDiagnosis:
 
     def __init__(self, model, touch):
         self.coupled, self._scene, self._moves, self.touch = model.coupled, model.scene, bool(model.motions), touch
-        touching = model.coupled.host.touching
-        self.least = LEAST * float(touching.range.min()) if touch.keep else -math.inf
-        self._stiffest = float(touching.stiffness.max())
+        contact_parameters = model.coupled.host.contact_parameters
+        self.least = LEAST * float(contact_parameters.range.min()) if touch.min_separation_fraction else -math.inf
+        self._stiffest = float(contact_parameters.stiffness.max())
 
     def check(self, x: wp.array) -> None:
         """Refuse start positions with overlaps, or with gaps too small for a barrier.
@@ -38,7 +38,7 @@ class ContactDiagnosis:
             SceneError: names the pair and by how much.
         """
         gap, pair = self.touch.closest(x)
-        least = self.least if self.touch.keep else -self.touch.search.reach
+        least = self.least if self.touch.min_separation_fraction else -self.touch.search.search_distance
         if gap <= least:
             meet = f"overlap by {-gap:.3g} m" if gap < 0.0 else "have no gap"
             if gap > 0.0:
@@ -54,7 +54,7 @@ class ContactDiagnosis:
         Empty where no pair is within range.
         """
         gap, pair = self.touch.closest(x)
-        if gap >= self.touch.search.reach:
+        if gap >= self.touch.search.search_distance:
             return ""
         return f"the smallest gap, {gap:.3g} m, is between {pair}; {self._widen(gap) if reason == outcome.MINIMUM_GAP else ''}"
 

@@ -22,7 +22,7 @@ class ContactModel:
 
     Attributes:
         shapes: collision primitives. search: candidates. terms: energy of active pairs.
-        keep: fraction of the thickness that motion preserves.
+        min_separation_fraction: fraction of the thickness that motion preserves.
     """
 
     def __init__(
@@ -34,30 +34,37 @@ class ContactModel:
         margin: float | None = None,
         exact: bool = False,
     ):
-        self.coupled, touching = coupled, coupled.host.touching
-        self.law, self.keep = touching.law, touching.keep
+        self.coupled, contact_parameters = coupled, coupled.host.contact_parameters
+        self.law, self.min_separation_fraction = contact_parameters.law, contact_parameters.min_separation_fraction
         self.shapes = shapes_of(coupled.host)
-        margin = margin or MARGIN * max(touching.size, touching.reach)
-        radius = coupled.touching["radius"]
-        self.search = BroadPhase(self.shapes, x, coupled.worlds, reach=touching.reach, margin=margin, radius=radius)
+        margin = margin or MARGIN * max(contact_parameters.size, contact_parameters.search_distance)
+        radius = coupled.contact_parameters["radius"]
+        self.search = BroadPhase(
+            self.shapes,
+            x,
+            coupled.worlds,
+            search_distance=contact_parameters.search_distance,
+            margin=margin,
+            radius=radius,
+        )
         self.terms = ContactPotential(
             self.search,
-            touching.density,
-            stiffness=touching.stiffness,
-            range=touching.range,
-            groups=touching.group,
-            friction=touching.friction,
-            inertia=touching.inertia,
-            ways=touching.ways,
+            contact_parameters.density,
+            stiffness=contact_parameters.stiffness,
+            range=contact_parameters.range,
+            groups=contact_parameters.group,
+            friction=contact_parameters.friction,
+            inertia=contact_parameters.inertia,
+            ways=contact_parameters.ways,
             friction_law=self.law.friction_law,
             velocity=self.law.velocity,
             linear=linear,
             silent=silent,
-            shared=coupled.touching,
+            shared=coupled.contact_parameters,
             exact=exact,
         )
 
-    def at(self, x: wp.array, rate: wp.array | None = None) -> None:
+    def evaluate(self, x: wp.array, rate: wp.array | None = None) -> None:
         """Compute energies and forces at blocks x, with room for all pairs. Not in a capture.
 
         Args:
@@ -72,8 +79,8 @@ class ContactModel:
         self.terms.brace(rate)
         self.terms.evaluate(x)
 
-    def rub(self, x: wp.array, v: wp.array) -> None:
-        """Compute friction at blocks x for velocities v, after `at`. Not in a capture."""
+    def evaluate_friction(self, x: wp.array, v: wp.array) -> None:
+        """Compute friction at blocks x for velocities v, after `evaluate`. Not in a capture."""
         start = wp.array(x.numpy() - v.numpy(), dtype=x.dtype, device=x.device)  # slips of one second, with rate one
         self.terms.lag(x)
         self.terms.evaluate(x, wp.full(self.coupled.worlds, 1.0, dtype=self.coupled.real, device=x.device), start)
@@ -81,11 +88,11 @@ class ContactModel:
     def friction(self, x: wp.array, v: wp.array, rate: wp.array | None = None) -> np.ndarray:
         """Return friction on blocks (W N, 3) [N] at x with velocities v, including markers of spinning objects.
 
-        Not in a capture; raises as `at`.
+        Not in a capture; raises as `evaluate`.
         """
-        self.at(x, rate)
+        self.evaluate(x, rate)
         pushed = self.terms.forces.numpy().astype(float)
-        self.rub(x, v)
+        self.evaluate_friction(x, v)
         return self.terms.forces.numpy() - pushed + self.terms.spins.forces(x, self.terms.frictions)
 
     def slides(self) -> bool:
@@ -97,27 +104,27 @@ class ContactModel:
         return False
 
     def find(self, x: wp.array) -> None:
-        """Search all candidates at blocks x; `at` must follow before energies. Not in a capture; raises as `at`."""
+        """Search all candidates at blocks x; `evaluate` must follow before energies. Not in a capture; raises as `evaluate`."""
         self.search.rebuild(x)
         self.search.search(x)
         self.search.fit(x)
 
     def pairs(self, x: wp.array, v: wp.array | None = None) -> dict[str, np.ndarray]:
-        """Return candidates at blocks x, after `at`, with friction for velocities v if given.
+        """Return candidates at blocks x, after `evaluate`, with friction for velocities v if given.
 
         Returns:
-            world: (n,). sizes: node counts of both primitives (n, 2), see `CollisionMesh.things`. `things`: their indices in a
+            world: (n,). sizes: node counts of both primitives (n, 2), see `CollisionMesh.primitives`. `primitives`: their indices in a
                 world (n, 2).
             gap: (n,) [m]. point: midpoint of the closest points (n, 3) [m]. force, friction: on the first primitive (n, 3) [N].
         """
-        rubs = [None] * len(self.terms.lists)
+        friction_sets = [None] * len(self.terms.lists)
         if v is not None and self.terms.frictions:
-            self.rub(x, v)
-            rubs = self.terms.frictions
-        lists = [self._pairs(*each, x) for each in zip(self.search.lists, self.terms.lists, rubs, strict=True)]
+            self.evaluate_friction(x, v)
+            friction_sets = self.terms.frictions
+        lists = [self._pairs(*each, x) for each in zip(self.search.lists, self.terms.lists, friction_sets, strict=True)]
         return {name: np.concatenate([values[name] for values in lists]) for name in lists[0]}
 
-    def _pairs(self, pairs, terms, rubs, x: wp.array) -> dict[str, np.ndarray]:
+    def _pairs(self, pairs, terms, friction_sets, x: wp.array) -> dict[str, np.ndarray]:
         count = int(pairs.count.numpy()[0])
         gap = wp.zeros(count, dtype=self.coupled.real, device=x.device)
         point = wp.zeros(count, dtype=x.dtype, device=x.device)
@@ -125,7 +132,7 @@ class ContactModel:
             kernel = query_kernel(pairs.kind, self.coupled.real)
             wp.launch(kernel, count, [pairs.pairs, pairs.sides, x], [gap, point], device=x.device)
         i, j = pairs.pairs.numpy()[:count].reshape(-1, 2).T
-        force, friction = (_of_first(part, pairs) for part in (terms, rubs))
+        force, friction = (_of_first(part, pairs) for part in (terms, friction_sets))
         return {
             "world": i // pairs.first.count,
             "sizes": np.broadcast_to([pairs.first.size, pairs.second.size], (count, 2)),
@@ -143,7 +150,7 @@ class ContactModel:
 
     def closest_nodes(self, x: wp.array) -> tuple[float, str, tuple]:
         """Return the smallest gap of all candidates [m], its pair, and the nodes of both; see `closest`."""
-        self.at(x)
+        self.evaluate(x)
         candidates = self.pairs(x)
         if not len(candidates["gap"]):
             return np.inf, "", ()
@@ -153,7 +160,7 @@ class ContactModel:
         ]
         first, second = (self.shapes.describe(*primitive) for primitive in primitives)
         world = f" in world {candidates['world'][k]}" if self.coupled.worlds > 1 else ""
-        nodes = tuple(self.shapes.things(size)[0][index] for size, index in primitives)
+        nodes = tuple(self.shapes.primitives(size)[0][index] for size, index in primitives)
         return float(candidates["gap"][k]), f"{first} and {second}{world}", nodes
 
 
@@ -173,8 +180,8 @@ def _of_first(part, pairs) -> np.ndarray:
 
 def shapes_of(host) -> CollisionMesh:
     """Return the collision primitives of the coupled system."""
-    touching, shapes = host.touching, CollisionMesh(host.rest)
-    for body in touching.bodies:
+    contact_parameters, shapes = host.contact_parameters, CollisionMesh(host.rest)
+    for body in contact_parameters.bodies:
         options = {"name": body.label, "still": body.still}
         if body.kind == PLANE:
             number = shapes.plane(body.nodes, name=body.label)
@@ -183,15 +190,15 @@ def shapes_of(host) -> CollisionMesh:
         elif body.kind == BALL:
             number = shapes.ball(int(body.nodes[0]), body.radius, **options)
         else:
-            exclusion = 0.0 if body.kind == CAPSULE else touching.law.exclusion_length
+            exclusion = 0.0 if body.kind == CAPSULE else contact_parameters.law.exclusion_length
             angles = body.angles if body.angles.size else None
             number = shapes.rod(
                 body.nodes, body.radius, closed=body.closed, exclusion_length=exclusion, angles=angles, **options
             )
         if body.markers.size:
             shapes.spin(number, np.append(body.nodes[0], body.markers))
-    for g, h in touching.ignored:
-        for first in np.flatnonzero(touching.group == g):
-            for second in np.flatnonzero(touching.group == h):
+    for g, h in contact_parameters.ignored:
+        for first in np.flatnonzero(contact_parameters.group == g):
+            for second in np.flatnonzero(contact_parameters.group == h):
                 shapes.ignore(int(first), int(second))
     return shapes

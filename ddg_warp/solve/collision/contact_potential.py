@@ -94,9 +94,12 @@ class ContactPotential:
             "friction": friction,
             "inertia": inertia,
         }
-        self.law, rubs = law_tables(search, inputs, groups, shared or {})
+        self.law, has_friction = law_tables(search, inputs, groups, shared or {})
         self.heavy = inertia is not None and bool(np.any(inertia))
-        self.lag_law, self._law_before = self.law, at_island_rate(self.law, self.real) if self.heavy and rubs else None
+        self.lag_law, self._law_before = (
+            self.law,
+            at_island_rate(self.law, self.real) if self.heavy and has_friction else None,
+        )
         nodes = len(search.shapes.points) * search.worlds
         self.gap = wp.zeros(search.worlds, dtype=self.real, device=self.device)
         self._no_rate = wp.zeros_like(self.gap)
@@ -107,14 +110,14 @@ class ContactPotential:
         self.lists = [ContactSet(pairs, law, nodes, self.real, self.linear, silenced, exact) for pairs in search.lists]
         self._version, self._lagged = search.version, -1
         self.spins = RotatingSurfaces(search)
-        self.frictions = self._with_friction(rubs, ways, friction_law, velocity, silenced)
+        self.frictions = self._with_friction(has_friction, ways, friction_law, velocity, silenced)
         self.start, self.more = wp.zeros_like(self.forces), wp.zeros_like(self.gap)
         self.rolls = any(part.rolls for part in self.frictions)
         self.blocks = ContactBlocks(search, len(self.law.square), self.linear, self.rolls)
         self.products = PairProduct(self._parts, self.law, self.real, self.linear)
         self._rub = PairProduct(self.frictions, self.law, self.real, self.linear) if self.frictions else None
         self._totals = totals = WorldSums(self.lists, self.frictions, search.worlds, self.real, self.device)
-        self.energy, self.touching, self.dissipated = totals.energy, totals.touching, totals.dissipated
+        self.energy, self.active_pairs, self.dissipated = totals.energy, totals.active_pairs, totals.dissipated
         self._no_iterates = (wp.zeros(0, dtype=int, device=self.device),) * 2
 
     @property
@@ -208,13 +211,13 @@ class ContactPotential:
         rate = self._no_rate if rate is None else rate
         iterates = self._no_iterates if iterates is None else iterates
 
-        def rub() -> None:
+        def evaluate_friction() -> None:
             self.spins(start, x)
             for part in self.frictions:
                 part.evaluate(x, start, rate, iterates)
 
         push = [partial(part.evaluate, x, self.law, self.gap) for part in self.lists]
-        device_arrays.side_by_side([*push, *([rub] if self.frictions else [])], self.device)
+        device_arrays.side_by_side([*push, *([evaluate_friction] if self.frictions else [])], self.device)
         device_arrays.side_by_side([self._sum_up, partial(self._totals, self.search.overflow)], self.device)
 
     def _sum_up(self) -> None:
@@ -224,7 +227,7 @@ class ContactPotential:
         """Reset the smallest gaps, and refuse lists that have grown since `fit`."""
         if self._version != self.search.version:
             raise SolverError("the lists of pairs have grown; call fit() of these terms, and capture graphs again")
-        self.gap.fill_(self.search.reach)
+        self.gap.fill_(self.search.search_distance)
 
     def product(self, v: wp.array, out: wp.array, x: wp.array | None = None, wanted: wp.array | None = None) -> None:
         """Add H v of the last `evaluate` to `out`, vectors of 3 (worlds times nodes,).
@@ -278,13 +281,13 @@ class ContactPotential:
         if self.frictions and self._lagged != self._version:
             raise SolverError("friction has no pairs of the step's start; call lag() there, and again after fit()")
 
-    def _with_friction(self, rubs: bool, multipliers, law: str, velocity: float, silent) -> list[FrictionSet]:
+    def _with_friction(self, has_friction: bool, multipliers, law: str, velocity: float, silent) -> list[FrictionSet]:
         """Return the friction of each list, none without friction."""
         if law not in FRICTION_LAWS:
             raise SceneError(f"friction_law = {law!r} of contact; it is one of {', '.join(FRICTION_LAWS)}")
         if not 0.0 < velocity < np.inf:
             raise SceneError(f"velocity = {velocity!r} of friction; it is positive and finite [m/s]")
-        if not rubs:
+        if not has_friction:
             return []
         number = self.law.friction.shape[1]
         same = multipliers is None or (np.asarray(multipliers) == 1.0).all()

@@ -78,7 +78,7 @@ class PairProduct:
             setattr(struct, name, getattr(pair_set.mollified, name))
         struct.kind = KINDS.index(kind) if isinstance(pair_set, ContactSet) else -1
         struct.edges = (kind.first == 2) + (kind == EDGES)
-        struct.rows, struct.things = pair_set.rows, pair_set.found.first.count
+        struct.rows, struct.primitives = pair_set.rows, pair_set.found.first.count
         return struct
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:

@@ -63,7 +63,7 @@ def at_island_rate(law, real):
 def _within_reach(search, within: np.ndarray, thickness: np.ndarray, groups: np.ndarray) -> None:
     """Refuse activation distances beyond the search distance."""
     shapes = search.shapes
-    _, radius, owner, _ = shapes.things(2)
+    _, radius, owner, _ = shapes.primitives(2)
     radii = np.zeros(len(groups))
     radii[owner] = radius
     thinnest = {int(g): np.flatnonzero(groups == g)[radii[groups == g].argmin()] for g in np.unique(groups)}
@@ -71,16 +71,16 @@ def _within_reach(search, within: np.ndarray, thickness: np.ndarray, groups: np.
         for h, second in thinnest.items():
             both = radii[first] + radii[second]
             excess = within[g, h] + (thickness[g, h] - both if thickness[g, h] >= 0.0 else 0.0)
-            if excess > search.reach * (1.0 + ROUNDING):
+            if excess > search.search_distance * (1.0 + ROUNDING):
                 raise SceneError(
                     f"{shapes.names[first]} and {shapes.names[second]} are in contact up to a distance of {both + excess:.6g} m, but"
-                    f" the broad phase covers {both + search.reach:.6g} m; give a search distance of {excess:.6g} m"
+                    f" the broad phase covers {both + search.search_distance:.6g} m; give a search distance of {excess:.6g} m"
                 )
 
 
 def _edges(shapes: CollisionMesh) -> tuple[np.ndarray, np.ndarray]:
     """Return squared rest lengths of edges (n,), and (n, 2): for both nodes 1/2 inside a rod, 0 at rod ends, -1 for shells."""
-    nodes, _, owner, span = shapes.things(2)
+    nodes, _, owner, span = shapes.primitives(2)
     ends = shapes.points[nodes]
     keys = owner[:, None] * len(shapes.points) + nodes
     _, node_of_entry, times = np.unique(keys, return_inverse=True, return_counts=True)

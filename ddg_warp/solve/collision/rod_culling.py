@@ -29,7 +29,7 @@ class RodCulling:
 
     def __init__(self, search):
         shapes, worlds, device, real = search.shapes, search.worlds, search.device, search.real
-        _, _, owner, span = shapes.things(2)
+        _, _, owner, span = shapes.primitives(2)
         self._sides, self._search, self._edges = search.lists[0].sides, search, len(owner)
         starts = np.flatnonzero(np.diff(owner, prepend=-1))
         ends = np.append(starts[1:], len(owner))
@@ -46,7 +46,7 @@ class RodCulling:
             wp.array(values, dtype=int, device=device) for values in (runs, run_of, first_partners)
         )
         self._boxes = Aabbs(len(runs), worlds, device)
-        nodes = shapes.points[shapes.things(2)[0]]  # rest positions, for a first BVH
+        nodes = shapes.points[shapes.primitives(2)[0]]  # rest positions, for a first BVH
         for corner, bound, ends in (
             (self._boxes.lower, np.minimum, nodes.min(1)),
             (self._boxes.upper, np.maximum, nodes.max(1)),
@@ -58,7 +58,7 @@ class RodCulling:
         self._seen = wp.full((worlds, self._edges), vector(np.inf), dtype=vector, device=device)
         self._loose = wp.zeros((worlds, len(shapes.names)), dtype=int, device=device)
         self._mean, self._mean_after, self._drift = (wp.zeros(worlds, dtype=vector, device=device) for _ in range(3))
-        self._near = 0.5 * (1.0 + SLACK) * search.reach
+        self._near = 0.5 * (1.0 + SLACK) * search.search_distance
         self.known = wp.zeros((KNOWN, worlds), dtype=int, device=device)
         self.doubt = self.known[DOUBT]
         self.doubt.fill_(1)

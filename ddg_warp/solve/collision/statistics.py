@@ -57,7 +57,7 @@ class ContactStatistics:
 
     def __call__(self, flags: wp.array) -> None:
         """Add the terms as evaluated last, in worlds whose flags say that a substep is done."""
-        inputs = [self.terms.touching, self.terms.dissipated, flags]
+        inputs = [self.terms.active_pairs, self.terms.dissipated, flags]
         wp.launch(self._take, self._worlds, inputs, [self.counts, self.work], device=self.device)
 
     def statistics(self) -> dict:
@@ -71,7 +71,7 @@ class ContactStatistics:
         result = {
             "searches": int(search.searches.numpy()[0]),
             "refused_crossings": int(self.crossed.numpy()[0]),
-            "smallest_gap": float(least) if least < least.dtype.type(search.reach) else math.inf,
+            "smallest_gap": float(least) if least < least.dtype.type(search.search_distance) else math.inf,
             "candidates": sum(int(pairs.count.numpy()[0]) for pairs in search.lists),
             "contacts": {"mean": float(mean), "last": int(counts[LAST].sum())},
         }

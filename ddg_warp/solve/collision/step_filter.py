@@ -35,28 +35,41 @@ class StepFilter:
         self._unpicked = wp.zeros(0, dtype=int, device=device)
         self.shares = self._all[0]
 
-    def check(self, unit: wp.array, together: wp.array, units: int) -> None:
+    def check(self, ccd_body: wp.array, together: wp.array, num_ccd_bodies: int) -> None:
         """Refuse invalid arrays."""
-        if unit.shape != (self._nodes,) or unit.dtype is not wp.int32:
+        if ccd_body.shape != (self._nodes,) or ccd_body.dtype is not wp.int32:
             raise SceneError(
-                f"unit of a motion: one int32 for each of {self._nodes} nodes, not {unit.shape} of {unit.dtype}"
+                f"ccd_body of a motion: one int32 for each of {self._nodes} nodes, not {ccd_body.shape} of {ccd_body.dtype}"
             )
         if together.shape != (self._worlds,) or together.dtype is not wp.int32:
             raise SceneError(
                 f"together of a motion: one int32 for each of {self._worlds} world(s), not {together.shape} of {together.dtype}"
             )
-        if not 1 <= units <= self._nodes:
-            raise SceneError(f"units = {units!r} of a motion; they are 1 to {self._nodes}, the nodes of a world")
+        if not 1 <= num_ccd_bodies <= self._nodes:
+            raise SceneError(
+                f"num_ccd_bodies = {num_ccd_bodies!r} of a motion; they are 1 to {self._nodes}, the nodes of a world"
+            )
 
     @timer("additive CCD")
-    def __call__(self, base, move, q, unit, together, units: int, keep: float, reach: float, search) -> None:
+    def __call__(
+        self,
+        base,
+        move,
+        q,
+        ccd_body,
+        together,
+        num_ccd_bodies: int,
+        min_separation_fraction: float,
+        search_distance: float,
+        search,
+    ) -> None:
         """Lower step fractions round by round, and limit q accordingly.
 
         Args:
-            reach: search distance [m]; search: (overflow, time, done, start, end) of a `BroadPhase`.
+            search_distance: search distance [m]; search: (overflow, time, done, start, end) of a `BroadPhase`.
         """
         overflow, time, done, *motion = search
-        shares, before, lowered = (array[: self._worlds * units] for array in self._all)
+        shares, before, lowered = (array[: self._worlds * num_ccd_bodies] for array in self._all)
         self.shares = shares
         self._sweep(self._start, len(shares), [], [shares, before, lowered])
         for times in (self._earliest, self._later, time):
@@ -68,10 +81,22 @@ class StepFilter:
             count, picked = pairs.count, self._unpicked
             if again:
                 number.zero_()
-                inputs = [pairs.pairs, count, pairs.sides, unit, units, shares, before]
+                inputs = [pairs.pairs, count, pairs.sides, ccd_body, num_ccd_bodies, shares, before]
                 device_arrays.take_turns(pick, pairs.capacity, inputs, [pairs.picked, number], self._device)
                 count, picked = number, pairs.picked
-            inputs = [pairs.pairs, count, picked, pairs.sides, base, move, keep, reach, unit, units, shares]
+            inputs = [
+                pairs.pairs,
+                count,
+                picked,
+                pairs.sides,
+                base,
+                move,
+                min_separation_fraction,
+                search_distance,
+                ccd_body,
+                num_ccd_bodies,
+                shares,
+            ]
             device_arrays.take_turns(limit, pairs.capacity, inputs, [lowered, times], self._device)
 
         def go(times: wp.array, again: bool = True) -> None:
@@ -87,7 +112,7 @@ class StepFilter:
         wp.capture_while(self._changed, lambda: go(self._later))
         outputs = [shares, time, self.limited]
         self._sweep(self._finish, len(shares), [self._earliest, self._open, overflow], outputs)
-        self._sweep(self._shorten, len(q), [base, move, unit, units, shares, done, together], [q, *motion])
+        self._sweep(self._shorten, len(q), [base, move, ccd_body, num_ccd_bodies, shares, done, together], [q, *motion])
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
         device_arrays.sweep(kernel, count, inputs, outputs, self._device)

@@ -72,10 +72,10 @@ class Arcs:
 
     def _room(self, swept: Swept) -> np.ndarray:
         """Return the allowed sagitta of surfaces in every world (worlds,) [m], infinite if nothing can meet them."""
-        coupled, contact, worlds = self.model.coupled, self.model.coupled.host.touching, self.model.worlds
+        coupled, contact, worlds = self.model.coupled, self.model.coupled.host.contact_parameters, self.model.worlds
         count = len(contact.names)
-        within = coupled.touching["range"].numpy().reshape(worlds, count, count)
-        radii = coupled.touching["radius"].numpy().reshape(worlds, -1)
+        within = coupled.contact_parameters["range"].numpy().reshape(worlds, count, count)
+        radii = coupled.contact_parameters["radius"].numpy().reshape(worlds, -1)
         least = np.stack([radii[:, contact.group == g].min(1) for g in range(count)], 1)
         first, second = contact.meeting
         meets = np.isin(first, swept.groups) | np.isin(second, swept.groups)

@@ -42,8 +42,8 @@ class Swept:
 def swept_surfaces(model) -> list[Swept]:
     """Return the moved surfaces of every motion of a model with contact."""
     host, starts, result = model.coupled.host, pose_starts(model.motions), []
-    unit, units = number_bodies(host)
-    unit, supported = unit[: host.nodes], host.holds[: host.nodes].any(1)
+    ccd_body, num_ccd_bodies = number_bodies(host)
+    ccd_body, supported = ccd_body[: host.nodes], host.holds[: host.nodes].any(1)
     for motion, first, stop in zip(model.motions, starts, starts[1:], strict=False):
         poses = host.moving[:, 1:]
         within = (poses >= first) & (poses < stop)
@@ -55,10 +55,13 @@ def swept_surfaces(model) -> list[Swept]:
         )
         # bodies that this motion alone supports, at two or more nodes, move with it as a whole, joined bodies included
         mine, all_held = (
-            np.bincount(unit[some & (unit >= 0)], minlength=units + 1) for some in (supported & moved, supported)
+            np.bincount(ccd_body[some & (ccd_body >= 0)], minlength=num_ccd_bodies + 1)
+            for some in (supported & moved, supported)
         )
-        carried = np.append((mine > 1) & (mine == all_held), False)[unit]
-        moved_nodes = [(b, body.nodes[(moved | carried)[body.nodes]]) for b, body in enumerate(host.touching.bodies)]
+        carried = np.append((mine > 1) & (mine == all_held), False)[ccd_body]
+        moved_nodes = [
+            (b, body.nodes[(moved | carried)[body.nodes]]) for b, body in enumerate(host.contact_parameters.bodies)
+        ]
         moved_nodes = [(b, nodes) for b, nodes in moved_nodes if len(nodes)]
         if moved_nodes:
             result.append(_swept(host, motion, *zip(*moved_nodes, strict=True), rows))
@@ -67,9 +70,9 @@ def swept_surfaces(model) -> list[Swept]:
 
 def _swept(host, motion, numbers: tuple[int, ...], parts: tuple[np.ndarray, ...], rows: np.ndarray) -> Swept:
     """Return the surfaces of nodes of some bodies that a motion moves, by displacements `rows` of nodes."""
-    bodies, nodes = [host.touching.bodies[b] for b in numbers], np.concatenate(parts)
+    bodies, nodes = [host.contact_parameters.bodies[b] for b in numbers], np.concatenate(parts)
     points, most = host.rest[nodes], np.inf
-    if host.touching.has_friction and any(len(body.markers) for body in bodies):
+    if host.contact_parameters.has_friction and any(len(body.markers) for body in bodies):
         most = SPIN
     planes = [body for body in bodies if body.kind == PLANE]
     if planes:
@@ -79,7 +82,9 @@ def _swept(host, motion, numbers: tuple[int, ...], parts: tuple[np.ndarray, ...]
     if motion.count is None:
         points = _farthest(points, motion)
     label = bodies[0].label + (f" and {len(bodies) - 1} more" if len(bodies) > 1 else "")
-    return Swept(motion, label, points, rows[nodes], np.unique(host.touching.group[list(numbers)]).tolist(), most)
+    return Swept(
+        motion, label, points, rows[nodes], np.unique(host.contact_parameters.group[list(numbers)]).tolist(), most
+    )
 
 
 def _foot(nodes: np.ndarray, pivot) -> np.ndarray:

@@ -12,7 +12,7 @@ class WorldSums:
 
     Attributes:
         `energy`: (worlds,) [J], infinite after a capacity overflow.
-        `touching`: (worlds,) number of active pairs.
+        `active_pairs`: (worlds,) number of active pairs.
         `dissipated`: (worlds,) [J] friction work from the start to the last evaluation, the sum of forces times slip.
     """
 
@@ -20,9 +20,9 @@ class WorldSums:
         self._contacts, self._frictions, self._device = contacts, frictions, device
         self._real, self._worlds = real, worlds
         self.energy, self.dissipated = (wp.zeros(worlds, dtype=real, device=device) for _ in range(2))
-        self.touching = wp.zeros(worlds, dtype=int, device=device)
+        self.active_pairs = wp.zeros(worlds, dtype=int, device=device)
         primitives = max(contact.found.first.count for contact in contacts)
-        self._of_things = wp.zeros((ROWS * worlds, primitives), dtype=real, device=device)
+        self._of_primitives = wp.zeros((ROWS * worlds, primitives), dtype=real, device=device)
         self._of_worlds = wp.zeros((ROWS, worlds), dtype=real, device=device)
         self._sum = Sums(ROWS * worlds, primitives, real, device)
         self._add, self._tell = total_kernels(real, device_arrays.serial(device))
@@ -39,16 +39,20 @@ class WorldSums:
         """Sum the last evaluation over each world."""
         inputs = [self._written_by, self._worlds]
         device_arrays.sweep(
-            self._add, self._of_things.shape[1], inputs, [self._of_things], self._device, worlds=self._worlds
+            self._add, self._of_primitives.shape[1], inputs, [self._of_primitives], self._device, worlds=self._worlds
         )
-        self._sum(self._of_things, self._of_worlds.flatten())
-        outputs = [self.energy, self.touching, self.dissipated]
+        self._sum(self._of_primitives, self._of_worlds.flatten())
+        outputs = [self.energy, self.active_pairs, self.dissipated]
         wp.launch(self._tell, self._worlds, [self._of_worlds, overflow], outputs, device=self._device)
 
     def _written(self, pair_set):
         struct = written_struct(self._real)()
         struct.count, struct.starts, struct.partners = pair_set.count, pair_set.starts, pair_set.partners
-        struct.energy, struct.used, struct.things = pair_set.energy, pair_set.factor.used, pair_set.found.first.count
+        struct.energy, struct.used, struct.primitives = (
+            pair_set.energy,
+            pair_set.factor.used,
+            pair_set.found.first.count,
+        )
         if pair_set in self._frictions:
             struct.work = pair_set.work
         return struct

@@ -62,14 +62,14 @@ class CoupledTangent(TangentBlock):
             values = out.numpy().astype(np.float64)
             yield part.term.name, values.reshape(self.coupled.worlds, -1)
         if self.model.touch:
-            self.model.touch.at(state.coupled.q, state.coupled.rate)
+            self.model.touch.evaluate(state.coupled.q, state.coupled.rate)
             yield "contact", self.model.touch.terms.energy.numpy().astype(np.float64)[:, None]
 
     def gradient(self, state) -> np.ndarray:
         elastic = self.elastic_gradient(state)
         if not self.model.touch:
             return elastic
-        self.model.touch.at(state.coupled.q, state.coupled.rate)
+        self.model.touch.evaluate(state.coupled.q, state.coupled.rate)
         return elastic - self.into(self.model.touch.terms.forces.numpy().astype(np.float64).ravel())
 
     def elastic_gradient(self, state) -> np.ndarray:
@@ -123,7 +123,7 @@ class CoupledTangent(TangentBlock):
             total += np.bincount(places, spread.ravel(), len(total))
         elastic = sparse.csc_matrix((total, rows, starts), shape=(self.size, self.size))
         if self.model.touch:
-            self.model.touch.at(state.coupled.q, state.coupled.rate)
+            self.model.touch.evaluate(state.coupled.q, state.coupled.rate)
             elastic = elastic + exact_hessian.hessian(self.model.touch.terms, state.coupled.q)
         return self.matrix(elastic)
 
@@ -258,10 +258,10 @@ class CoupledTangent(TangentBlock):
         blocks = [self.host.bodies.limits(body_loads) for body_loads in loads.reshape(self.coupled.worlds, -1)]
         return np.repeat(np.concatenate(blocks), 3)
 
-    def sums(self, loads: np.ndarray, rtol: float, residual: np.ndarray, floor: np.ndarray):
+    def sums(self, loads: np.ndarray, rtol: float, residual: np.ndarray, rounding_floor: np.ndarray):
         """Return the subset residual test and the largest excess over rounding by world; see `residual_tolerance.largest_excess`."""
         by_world = loads.reshape(self.coupled.worlds, -1), residual.reshape(self.coupled.worlds, -1, 3)
-        floors = floor.reshape(self.coupled.worlds, -1, 3).max(2)
+        floors = rounding_floor.reshape(self.coupled.worlds, -1, 3).max(2)
         tests = [
             largest_excess(self.host.bodies.levels, body_loads, rtol, r, f)
             for body_loads, r, f in zip(*by_world, floors, strict=True)

@@ -5,7 +5,7 @@ import warp as wp
 from scipy import sparse
 
 from ddg_warp import device_arrays
-from ddg_warp.kernels.adjoint.contact import NUMBERS, ROLLED, SPUN, rub_kernel
+from ddg_warp.kernels.adjoint.contact import NUMBERS, ROLLED, SPUN, friction_jacobian_kernel
 from ddg_warp.kernels.collision.contact.assembly import ITEMS, PAIR_NODES
 from ddg_warp.kernels.terms import FRICTION_LAWS
 from ddg_warp.solve.collision.rolling_rotation import rotated_by
@@ -15,18 +15,23 @@ class FrictionJacobian:
     """Derivatives of friction on the pairs of an `ExactContact`.
 
     Attributes:
-        spun, radii, by_direction: further outputs of `rub_kernel` per pair.
+        spun, radii, by_direction: further outputs of `friction_jacobian_kernel` per pair.
     """
 
     def __init__(self, coupled, system):
-        self.coupled, self.system, terms, touching = coupled, system, system.terms, coupled.host.touching
-        self._velocity = touching.law.velocity
-        law, friction = touching.density, FRICTION_LAWS[touching.law.friction_law]
+        self.coupled, self.system, terms, contact_parameters = (
+            coupled,
+            system,
+            system.terms,
+            coupled.host.contact_parameters,
+        )
+        self._velocity = contact_parameters.law.velocity
+        law, friction = contact_parameters.density, FRICTION_LAWS[contact_parameters.law.friction_law]
         self._spins = bool(terms.frictions) and terms.spins.any
         self._rolls = any(friction_terms.rolls for friction_terms in terms.frictions)
         self._leads = any(friction_terms.directions[0] is not None for friction_terms in terms.frictions)
         self.kernels = [
-            rub_kernel(
+            friction_jacobian_kernel(
                 friction_terms.found.kind,
                 law,
                 friction,
@@ -69,21 +74,21 @@ class FrictionJacobian:
             numbers: output, derivatives by the parameters of pairs.
         """
         terms = self.system.terms
-        rub = terms.frictions[index]
-        inputs = [rub.pairs, rub.count, rub.found.sides, terms.lag_law, *ends, rub.factor.used]
+        friction = terms.frictions[index]
+        inputs = [friction.pairs, friction.count, friction.found.sides, terms.lag_law, *ends, friction.factor.used]
         inputs += [
             *positions,
             w,
             self._velocity,
             rate,
-            *rub.directions,
+            *friction.directions,
             terms.spins.places,
             terms.spins.turned.flatten(),
         ]
-        written = [rub.gradient, self._start_parts, self._lagged_parts]
+        written = [friction.gradient, self._start_parts, self._lagged_parts]
         more = [numbers, self.by_direction, self.spun, self.radii]
         device_arrays.take_turns(
-            self.kernels[index], rub.found.capacity, inputs, [*written, *more], self.coupled.device
+            self.kernels[index], friction.found.capacity, inputs, [*written, *more], self.coupled.device
         )
         return written
 
@@ -109,20 +114,20 @@ class FrictionJacobian:
 
         Each pair has private blocks, behind the blocks of the coupled system; w is a unit vector there, one component at a time.
         """
-        rub = self.system.terms.frictions[index]
-        count, device, size = int(rub.count.numpy()[0]), self.coupled.device, 3 * len(q)
-        blocks, angles, ends = rub.factor.nodes.numpy()[:count], rub.factor.angles, None
-        if rub.rolls:
+        friction = self.system.terms.frictions[index]
+        count, device, size = int(friction.count.numpy()[0]), self.coupled.device, 3 * len(q)
+        blocks, angles, ends = friction.factor.nodes.numpy()[:count], friction.factor.angles, None
+        if friction.rolls:
             blocks = np.column_stack([blocks, angles.numpy()[:count]])
-        involved = (rub.factor.used.numpy()[:count, None] != 0) & (blocks >= 0)
-        involved[:, rub.found.kind.first + rub.found.kind.second : PAIR_NODES] = False
+        involved = (friction.factor.used.numpy()[:count, None] != 0) & (blocks >= 0)
+        involved[:, friction.found.kind.first + friction.found.kind.second : PAIR_NODES] = False
         private = np.where(involved, len(q) + np.arange(blocks.size).reshape(blocks.shape), blocks).astype(np.int32)
         nodes = device_arrays.upload(private[:, :PAIR_NODES], wp.vec4i, device)
-        if rub.rolls:
+        if friction.rolls:
             angles = device_arrays.upload(private[:, PAIR_NODES:], wp.vec2i, device)
-        if rub.directions[0]:
-            world, first = np.divmod(rub.pairs.numpy()[:count, 0], rub.found.first.count)
-            ends = rub.directions[0].numpy()[first] + world[:, None] * self.coupled.blocks
+        if friction.directions[0]:
+            world, first = np.divmod(friction.pairs.numpy()[:count, 0], friction.found.first.count)
+            ends = friction.directions[0].numpy()[first] + world[:, None] * self.coupled.blocks
         start, x = (
             wp.array(np.concatenate([positions, positions[blocks.ravel()]]), dtype=q.dtype, device=device)
             for positions in (before.numpy(), q.numpy())

@@ -31,7 +31,7 @@ class FrictionNewton:
 
     def __init__(self, model, residuals, share: Callable[[np.ndarray, np.ndarray], float], reach: float):
         self.model, self.residuals, self.tangent = model, residuals, residuals.tangent
-        self._share, self._longest, self._rubbing = share, FAR * reach, None
+        self._share, self._longest, self._friction_jacobian = share, FAR * reach, None
 
     def __call__(self, state: State, load_factor: float, write_sliding: Callable[[State], None]) -> str:
         """Move the state into balance and return the outcome; without balance the state stays, and the outcome is empty.
@@ -90,11 +90,11 @@ class FrictionNewton:
 
     def _matrix(self, state: State, load_factor: float) -> sparse.csc_matrix:
         coupled, tangent_block, sliding = self.model.coupled, self.tangent.parts[-1], state.sliding
-        if self._rubbing is None:
-            self._rubbing = FrictionJacobian(coupled, ExactContact(coupled))
+        if self._friction_jacobian is None:
+            self._friction_jacobian = FrictionJacobian(coupled, ExactContact(coupled))
         rate = wp.full(coupled.worlds, 1.0 / sliding.increment, dtype=coupled.real, device=coupled.device)
-        rubbing = self._rubbing.matrix(state.coupled.q, sliding.begun(state.coupled.q), rate)
-        matrix = tangent_block.potential_hessian(state) + tangent_block.matrix(rubbing)
+        friction_jacobian = self._friction_jacobian.matrix(state.coupled.q, sliding.begun(state.coupled.q), rate)
+        matrix = tangent_block.potential_hessian(state) + tangent_block.matrix(friction_jacobian)
         following = self.tangent.load_stiffness(load_factor, self.tangent.dofs(state))
         matrix = sparse.csc_matrix(matrix if following is None else matrix + following)
         return matrix + sparse.diags(SPIN * np.abs(matrix.diagonal()))

@@ -63,7 +63,7 @@ class Step:
         taken: accepted fraction (islands,), 0 for inactive islands; failed: islands without an accepted fraction.
         turn: largest edge rotation of the full step (islands,) [rad].
         gain, model: actual and predicted decrease of the potential (islands,) [J].
-        noise: rounding floor of the potential at the start (islands,) [J].
+        rounding_error: rounding floor of the potential at the start (islands,) [J].
     """
 
     end: Iterate
@@ -73,7 +73,7 @@ class Step:
     turn: np.ndarray
     gain: np.ndarray
     model: np.ndarray
-    noise: np.ndarray
+    rounding_error: np.ndarray
 
 
 class DirectNewton:
@@ -94,7 +94,7 @@ class DirectNewton:
             Rises(search) if self.tangent.model.coupled and not self.follows and not self.tangent.model.touch else None
         )
         for _ in range(self.options.max_iterations):
-            exact = self._stiffness(search.here, load_factor)
+            exact = self._stiffness(search.current, load_factor)
             if search.converged(exact):
                 return search.found()
             self.owner.iterations += 1
@@ -161,16 +161,16 @@ class Search:
     """
 
     def __init__(self, descent: DirectNewton, state: State, load_factor: float):
-        self.descent, self.owner, self.at = descent, descent.owner, load_factor
+        self.descent, self.owner, self.load_factor = descent, descent.owner, load_factor
         self.tangent, self.residuals = descent.tangent, descent.owner.residuals
         self.restart(descent.iterate(state, load_factor))
-        self.first = self.residuals.first_scale(self.here.outer, self.here.gradient)
-        self.region = TrustRegion(self.tangent, self.here.q, descent.options.rotation_cap)
+        self.first = self.residuals.first_scale(self.current.outer, self.current.gradient)
+        self.region = TrustRegion(self.tangent, self.current.q, descent.options.rotation_cap)
 
     def restart(self, iterate: Iterate) -> None:
         """Restart from an iterate, without converged islands."""
         count = self.tangent.islands
-        self.here, self._best, self._least = iterate, np.full(count, np.inf), np.full(count, np.inf)
+        self.current, self._best, self._least = iterate, np.full(count, np.inf), np.full(count, np.inf)
         self.done, self.small, self._below, self._lost = (np.zeros(count, bool) for _ in range(4))
         self._since = np.zeros(count, int)
 
@@ -181,7 +181,7 @@ class Search:
         slivers, may exceed that bound. Then an island has converged to rounding if the predicted decrease is below the rounding of
         the energy and residuals have not halved for some steps.
         """
-        iterate, residuals = self.here, self.residuals
+        iterate, residuals = self.current, self.residuals
         scale = np.maximum(self.first, residuals.load_scale(iterate.outer, iterate.gradient))
         excess, small = residuals.by_island(iterate.residual, iterate.gradient, exact, iterate.q, scale)
         below, merit = excess <= 0.0, self.merit(iterate)
@@ -197,13 +197,15 @@ class Search:
 
     def found(self) -> State:
         """Return the state of the iterate as the equilibrium."""
-        return self.owner.found(self.here.state, self.here.outer, self.here.residual, self.at, self.small)
+        return self.owner.found(
+            self.current.state, self.current.outer, self.current.residual, self.load_factor, self.small
+        )
 
     def failure(self, outcome: str) -> SolverError:
         """Return the error of a failed search."""
-        message = self.residuals.where(outcome, self.here.residual, self.at)
+        message = self.residuals.where(outcome, self.current.residual, self.load_factor)
         gaining = outcome == "max_iterations" and not self._lost[~self.done].any()
-        return SolverError(message, state=self.here.state, outcome=outcome, gaining=gaining)
+        return SolverError(message, state=self.current.state, outcome=outcome, gaining=gaining)
 
     def merit(self, iterate: Iterate) -> np.ndarray:
         """Return the residual norm of every island (islands,) [N]."""
@@ -216,7 +218,7 @@ class Search:
         elastic = self.tangent.island_energies(after.energies - before.energies)
         return elastic - np.bincount(self.tangent.island, work, self.tangent.islands)
 
-    def noise(self, iterate: Iterate) -> np.ndarray:
+    def rounding_error(self, iterate: Iterate) -> np.ndarray:
         """Return the rounding floor of a change of the potential (islands,) [J]."""
         of_dofs = np.abs(iterate.gradient) * self.residuals.magnitude(iterate.q)
         of_forces = np.bincount(self.tangent.island, of_dofs, self.tangent.islands)
@@ -239,15 +241,15 @@ class Search:
         self.accept(step)
         if failed.any():
             self.done = self.done | failed
-            q = np.where(failed[self.tangent.island], self.here.q, step.end.q)
-            step.end = self.descent.iterate(self.here.state, self.at, q)
-        self.here = step.end
+            q = np.where(failed[self.tangent.island], self.current.q, step.end.q)
+            step.end = self.descent.iterate(self.current.state, self.load_factor, q)
+        self.current = step.end
 
     def accept(self, step: Step) -> None:
         """Adapt the trust radius to a step."""
         taken = np.where(step.failed, 0.0, step.taken)
-        self.region.resize(taken, step.turn, step.gain, step.model, step.noise)
-        self._lost = np.where(self.done, self._lost, step.model <= 10.0 * step.noise)
+        self.region.resize(taken, step.turn, step.gain, step.model, step.rounding_error)
+        self._lost = np.where(self.done, self._lost, step.model <= 10.0 * step.rounding_error)
 
     def propose(self, hessian: sparse.csc_matrix, active: np.ndarray, free: np.ndarray | None = None) -> Step:
         """Return a step by `hessian` with the largest fraction that the line search accepts, per island.
@@ -257,12 +259,12 @@ class Search:
             free: islands (islands,) that may take the full step if energies are finite and the predicted decrease is above rounding;
                 `failed` then marks islands where the line search refuses it.
         """
-        start, descent, tangent = self.here, self.descent, self.tangent
-        noise, island, cap = self.noise(start), tangent.island, descent.options.rotation_cap
+        start, descent, tangent = self.current, self.descent, self.tangent
+        rounding_error, island, cap = self.rounding_error(start), tangent.island, descent.options.rotation_cap
         if descent.follows:
             direction = np.where(active[island], descent.regular(hessian, start.residual), 0.0)
         else:
-            direction = self.region.step(hessian, start.residual, start.q, active, noise)
+            direction = self.region.step(hessian, start.residual, start.q, active, rounding_error)
         turn = tangent.rotations(start.q, direction)
         shortened = np.minimum(1.0, cap / np.maximum(1e-300, turn))
         direction, turn = shortened[island] * direction, shortened * turn
@@ -271,28 +273,30 @@ class Search:
         merit, taken, wanted = self.merit(start), active.astype(float), active.copy()
         for _ in range(HALVINGS):
             step, taken = self._move(taken[island] * direction, taken)
-            end = descent.iterate(start.state, self.at, np.where(active[island], step, start.q))
+            end = descent.iterate(start.state, self.load_factor, np.where(active[island], step, start.q))
             change, after = self.change(start, end), self.merit(end)
             model = taken * slope - 0.5 * taken**2 * curvature
             finite = np.isfinite(change) & np.isfinite(after)
             if descent.follows:
                 good = (after < (1.0 - 1e-4 * taken) * merit) | ((taken == 1.0) & (after < 10.0 * merit))
             else:
-                good = np.where(model > 10.0 * noise, change <= -1e-4 * model + noise, after <= 2.0 * merit)
+                good = np.where(
+                    model > 10.0 * rounding_error, change <= -1e-4 * model + rounding_error, after <= 2.0 * merit
+                )
             wanted = active & ~(good & finite)
-            refused = wanted if free is None else wanted & ~(free & finite & (model > 10.0 * noise))
+            refused = wanted if free is None else wanted & ~(free & finite & (model > 10.0 * rounding_error))
             if not refused.any():
                 break
             taken = np.where(refused, 0.5 * taken, taken)
-        return Step(end, direction, taken, wanted, turn, -change, slope - 0.5 * curvature, noise)
+        return Step(end, direction, taken, wanted, turn, -change, slope - 0.5 * curvature, rounding_error)
 
     def _move(self, step: np.ndarray, taken: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return dofs after a step limited by CCD, and the fractions `taken` times the CCD step fraction."""
-        moved = self.tangent.retract(self.here.q, step)
+        moved = self.tangent.retract(self.current.q, step)
         if not self.tangent.model.touch:
             return moved, taken
-        share = self.owner.coupled.share(self.here.q, moved)
-        return self.here.q + share * (moved - self.here.q), share * taken
+        share = self.owner.coupled.share(self.current.q, moved)
+        return self.current.q + share * (moved - self.current.q), share * taken
 
 
 class Rises:
@@ -307,7 +311,7 @@ class Rises:
         is_coupled = self.tangent.parts[-1].islands
         self.islands = np.arange(self.tangent.islands) >= self.tangent.islands - is_coupled
         self.exhausted, self.begun, self.returns = False, self.tangent.shells_alone, 0
-        self._mark(search.here, None)
+        self._mark(search.current, None)
 
     def step(self, exact: sparse.csc_matrix) -> None:
         """Take a step that may raise the energy, or return to the best state."""
@@ -321,20 +325,24 @@ class Rises:
             if not self.begun:
                 search.end(step, step.failed)
                 return
-            self._mark(search.here, None)
-        hessian = exact if self.stress is None else self.tangent.stiffness(search.here.state, search.at, self.stress)
+            self._mark(search.current, None)
+        hessian = (
+            exact
+            if self.stress is None
+            else self.tangent.stiffness(search.current.state, search.load_factor, self.stress)
+        )
         free = self.islands if self.risen < RISES else None
         step = search.propose(hessian, ~search.done, free)
         failed = step.failed & ~self.islands
         if np.isfinite(step.gain[self.islands]).all():
-            stress = self.tangent.linear_stress(search.here.state, step.taken[self.tangent.island] * step.direction)
+            stress = self.tangent.linear_stress(search.current.state, step.taken[self.tangent.island] * step.direction)
             below = search.change(self.mark, step.end)
-            lower = (below < -search.noise(self.mark)) | search.done | ~self.islands
+            lower = (below < -search.rounding_error(self.mark)) | search.done | ~self.islands
             if lower.all() if self.risen else not step.failed[self.islands].any():
                 search.end(step, failed)
                 if self.risen > BOLD:
                     search.region.radius = np.where(self.islands, 0.5 * self.radius, search.region.radius)
-                self._mark(search.here, stress)
+                self._mark(search.current, stress)
                 return
             if self.risen < RISES and np.isfinite(below).all():
                 radius = search.region.radius * (RETURN if self.risen >= BOLD else 1.0)

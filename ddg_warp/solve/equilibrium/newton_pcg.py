@@ -213,7 +213,7 @@ class CoupledEquilibrium:
     """
 
     def __init__(self, owner):
-        model, options, touching = owner.model, owner.options, owner.model.coupled.host.touching
+        model, options, contact_parameters = owner.model, owner.options, owner.model.coupled.host.contact_parameters
         self.owner, self.model, self.coupled, self.tangent = owner, model, model.coupled, owner.tangent
         self.newton = StaticNewton(
             model,
@@ -223,10 +223,10 @@ class CoupledEquilibrium:
                 max_iterations=options.max_iterations,
                 rotation_cap=options.rotation_cap,
                 linear_rtol=FORCING,
-                psd="progressive" if touching else "gauss_newton",
+                psd="progressive" if contact_parameters else "gauss_newton",
             ),
         )
-        self.arcs = Arcs(model) if touching and model.motions else None
+        self.arcs = Arcs(model) if contact_parameters and model.motions else None
         self._rest = self.tangent.dofs(model.state())
         self._size = float(np.ptp(model.coupled.host.rest[: model.coupled.host.nodes], axis=0).max())
         self._start = model.coupled.empty()  # lagged data of a solve
@@ -235,8 +235,8 @@ class CoupledEquilibrium:
         self.wary = True
         self.polish = None
         if self.newton.has_friction and not large_static(model):
-            self.polish = FrictionNewton(model, owner.residuals, self.share, self.newton.contact.search.reach)
-        self._least, self._touching, self._friction_work = math.inf, [], 0.0
+            self.polish = FrictionNewton(model, owner.residuals, self.share, self.newton.contact.search.search_distance)
+        self._least, self._active_pairs, self._friction_work = math.inf, [], 0.0
 
     def pcg_iterations(self) -> int:
         """Return the number of PCG iterations so far, without the iterations of `following`."""
@@ -245,12 +245,12 @@ class CoupledEquilibrium:
     def count(self, state: State, increment: float) -> None:
         """Count contacts of an equilibrium, and its friction work over the time `increment`."""
         touch = self.model.touch
-        touch.at(state.coupled.q)
+        touch.evaluate(state.coupled.q)
         gap = float(touch.terms.gap.numpy().min())
-        self._least = min(self._least, gap if gap < touch.search.reach else math.inf)
-        self._touching.append(int(touch.terms.touching.numpy().sum()))
+        self._least = min(self._least, gap if gap < touch.search.search_distance else math.inf)
+        self._active_pairs.append(int(touch.terms.active_pairs.numpy().sum()))
         if self.newton.has_friction:
-            touch.rub(state.coupled.q, state.rubbing)
+            touch.evaluate_friction(state.coupled.q, state.slip_velocity)
             self._friction_work += increment * float(touch.terms.dissipated.numpy().sum())
 
     def contact_statistics(self) -> dict:
@@ -258,7 +258,7 @@ class CoupledEquilibrium:
 
         Without interpenetrations: iterates do not lead to an equilibrium along a straight motion.
         """
-        pairs = self._touching or [0]
+        pairs = self._active_pairs or [0]
         result = {
             "searches": int(self.newton.contact.search.searches.numpy()[0]),
             "smallest_gap": self._least,
@@ -324,32 +324,34 @@ class CoupledEquilibrium:
             consistent normal forces, to more than the rounding floor, and all contacts stick, or nodes have hardly moved.
         """
         state, owner, first = state.copy(), self.owner, before
-        rubs, rate = self.newton.has_friction, 1.0 / increment if self.newton.has_friction else 0.0
+        has_friction, rate = self.newton.has_friction, 1.0 / increment if self.newton.has_friction else 0.0
         repeats = self.coupled.edges or self.model.motions  # test the result with its own frames and support forces
         start = self.tangent.dofs(state)
         relaxation, settled = (
-            AitkenRelaxation(self.coupled.worlds) if rubs else None,
+            AitkenRelaxation(self.coupled.worlds) if has_friction else None,
             np.zeros(self.coupled.worlds, bool),
         )
-        if rubs:
+        if has_friction:
             loads = np.where(self.tangent.angle, 0.0, self.tangent.loads(load_factor, start)).reshape(
                 self.coupled.worlds, -1
             )
             self.newton.contact.terms.more.assign(sticking * np.abs(loads).sum(1))
         later = 0  # next solve to polish
-        for solves in range(owner.options.max_iterations if rubs else 1 + bool(repeats)):
-            on = solves > 0 and rubs
+        for solves in range(owner.options.max_iterations if has_friction else 1 + bool(repeats)):
+            on = solves > 0 and has_friction
             if on and not self.arrived:
                 state = state.copy()
                 self.tangent.assign(state, np.where(self.tangent.free, self.tangent.dofs(state), start))
             name = "slide on" if on else "solve"
-            if rubs:
+            if has_friction:
                 often = warily or sticking
                 self.newton.options = replace(self.newton.options, max_iterations=1 if often else LAGGED)
                 name += " warily" if often else ""
             self._replay(
                 name,
-                partial(self._begin, state, load_factor, before, self._slid(first, state) if rubs else None, rate),
+                partial(
+                    self._begin, state, load_factor, before, self._slid(first, state) if has_friction else None, rate
+                ),
                 partial(self.newton.search, self._start, on),
             )
             before, iterations, ends = state, self.newton.islands.iteration.numpy(), self.newton.islands.status.numpy()
@@ -374,7 +376,7 @@ class CoupledEquilibrium:
                     self.newton.contact.terms.more.zero_()
                 continue
             status = int(np.where(settled, np.minimum(ends, outcome.CONVERGED_TO_ROUNDING), ends).max())
-            if status > outcome.CONVERGED_TO_ROUNDING and not (rubs and status == outcome.MAX_ITERATIONS):
+            if status > outcome.CONVERGED_TO_ROUNDING and not (has_friction and status == outcome.MAX_ITERATIONS):
                 break
             if (near or solves >= TRIED) and solves >= later and self.polish and not settled.all():
                 if polished := self.polish(state, load_factor, partial(self._slides, first, increment)):
@@ -384,11 +386,11 @@ class CoupledEquilibrium:
             if settled.all():
                 break
         else:
-            status = outcome.MAX_ITERATIONS if rubs else status
+            status = outcome.MAX_ITERATIONS if has_friction else status
         outer = self.tangent.loads(load_factor, self.tangent.dofs(state))
         residual = outer - self.tangent.gradient(state)
         certain, name = True, outcome.NAMES[status]
-        if rubs:
+        if has_friction:
             self._slides(first, increment, state)
             residual += self.tangent.friction(state)
             free, points = self.tangent.free, ~self.tangent.angle
@@ -402,7 +404,7 @@ class CoupledEquilibrium:
                 name = UNSETTLED
         if status > outcome.CONVERGED_TO_ROUNDING or name == UNSETTLED:
             remedy = self.newton.contact.diagnosis.closest_pair(state.coupled.q, status) if self.newton.contact else ""
-            if rubs:
+            if has_friction:
                 remedy += "sliding bodies may have no equilibrium"
             message = owner.residuals.where(name, residual, load_factor, remedy)
             raise SolverError(message, state=state, outcome=name, gaining=name == "max_iterations")
@@ -417,7 +419,7 @@ class CoupledEquilibrium:
         displacement = np.abs(state.coupled.q.numpy() - begun).reshape(self.coupled.worlds, -1, 3)[
             :, : self.coupled.host.nodes
         ]
-        return bool(displacement.max() <= NEAR * self.newton.contact.search.reach)
+        return bool(displacement.max() <= NEAR * self.newton.contact.search.search_distance)
 
     def _slides(self, first: State, increment: float, state: State) -> None:
         """Write the slip of a state since the first one."""
@@ -426,8 +428,8 @@ class CoupledEquilibrium:
 
     def _untouched(self, before: State) -> bool:
         """Return True if the previous equilibrium had no contact forces, so that normal forces are unknown."""
-        self.model.touch.at(before.coupled.q)
-        return not self.model.touch.terms.touching.numpy().any()
+        self.model.touch.evaluate(before.coupled.q)
+        return not self.model.touch.terms.active_pairs.numpy().any()
 
     def _slid(self, first: State, state: State) -> np.ndarray:
         """Return blocks (W N, 3) from which slips of a state count: the `first` ones, twist angles about the frames of the state.

@@ -60,24 +60,24 @@ class Residuals:
         """Return the excess of every island (islands,), and the mask of islands below the tolerance itself."""
         tangent, rtol = self.tangent, self.rtol
         free, islands = tangent.free, tangent.island[tangent.free]
-        floor = self.rounding * (abs(hessian) @ self.magnitude(q) + np.abs(gradient))
+        rounding_floor = self.rounding * (abs(hessian) @ self.magnitude(q) + np.abs(gradient))
         limit, size = rtol * self.allowed(scale), np.abs(residual)
         masked = np.where(free, residual, 0.0)
         sums = [
-            part.sums(part_scale, rtol, tangent.of(part, masked), tangent.of(part, floor))
+            part.sums(part_scale, rtol, tangent.of(part, masked), tangent.of(part, rounding_floor))
             for part, part_scale in self._by_part(scale)
         ]
         small, excess = (np.concatenate(values) for values in zip(*sums, strict=True))
         small = small & (np.bincount(islands, (size > limit)[free], tangent.islands) == 0)
-        np.maximum.at(excess, islands, (size - np.maximum(limit, floor))[free])
+        np.maximum.at(excess, islands, (size - np.maximum(limit, rounding_floor))[free])
         return excess, small
 
     def magnitude(self, q: np.ndarray) -> np.ndarray:
         """Return magnitudes for the rounding of dofs: largest coordinate of the island, at least a radian for angles."""
         tangent = self.tangent
-        reach = np.zeros(tangent.islands)
-        np.maximum.at(reach, tangent.island[~tangent.angle], np.abs(q[~tangent.angle]))
-        return np.where(tangent.angle, np.maximum(1.0, np.abs(q)), reach[tangent.island])
+        magnitude = np.zeros(tangent.islands)
+        np.maximum.at(magnitude, tangent.island[~tangent.angle], np.abs(q[~tangent.angle]))
+        return np.where(tangent.angle, np.maximum(1.0, np.abs(q)), magnitude[tangent.island])
 
     def unbalanced(self, residual: np.ndarray, outer: np.ndarray) -> np.ndarray:
         """Return the largest fraction of loads that supports and obstacles do not balance, per world (worlds,).

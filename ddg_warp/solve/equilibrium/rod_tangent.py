@@ -157,13 +157,13 @@ class RodTangent(TangentBlock):
         lengths = np.where(self.angle, np.repeat(np.tile(self.group.host.length, self.group.worlds), self._dofs), 1.0)
         return np.repeat(loads, self._dofs) * lengths
 
-    def sums(self, loads: np.ndarray, rtol: float, residual: np.ndarray, floor: np.ndarray):
+    def sums(self, loads: np.ndarray, rtol: float, residual: np.ndarray, rounding_floor: np.ndarray):
         """Return the test of residual sums along each rod from the first node, and the largest excess over rounding (islands,)."""
         dim = self.group.kind.dim
         sums = np.abs(np.cumsum(self.blocks(residual)[..., :dim], axis=1))
         limit = (rtol * loads)[:, None, None]
-        noise = np.sqrt(np.cumsum(self.blocks(floor)[..., :dim] ** 2, axis=1))
-        return (sums <= limit).all((1, 2)), (sums - np.maximum(limit, noise)).max((1, 2))
+        rounding_error = np.sqrt(np.cumsum(self.blocks(rounding_floor)[..., :dim] ** 2, axis=1))
+        return (sums <= limit).all((1, 2)), (sums - np.maximum(limit, rounding_error)).max((1, 2))
 
     @property
     def _dofs(self) -> int:

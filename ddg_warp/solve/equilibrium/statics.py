@@ -161,8 +161,10 @@ class Equilibrium:
         scene_validate.warn_of_massless(model)
         self._descends = self._solver() == "direct"
         self.coupled = None if self._descends and not model.touch else CoupledEquilibrium(self)
-        self._rubs = model.touch is not None and model.coupled.host.touching.has_friction
-        self.factors = self._descends or (model.touch is not None and not self._rubs and not large_static(model))
+        self._has_friction = model.touch is not None and model.coupled.host.contact_parameters.has_friction
+        self.factors = self._descends or (
+            model.touch is not None and not self._has_friction and not large_static(model)
+        )
         self.mixed = self.tangent.shells_alone and self.coupled is None
         self.descent = DirectNewton(self)
         self.iterations = 0
@@ -218,7 +220,7 @@ class Equilibrium:
             raise SceneError(
                 f"statics: way is {argument_checks.shown(way)}; give a list, to which equilibria are added"
             )
-        if self._rubs and start == end:
+        if self._has_friction and start == end:
             raise SceneError(
                 f"contact: friction needs an increment of the load parameter, and from {start:g} to {end:g} "
                 "there is none; give start other than end, or friction=0"
@@ -247,9 +249,9 @@ class Equilibrium:
                 way.append(state)
             return state
         current, whole, cuts = start, (end - start) / load_steps, 0
-        if self._rubs:
+        if self._has_friction:
             self.coupled.wary = True
-        balanced = self._rubs or self._balanced(state, start)
+        balanced = self._has_friction or self._balanced(state, start)
         while current != end:
             increment = whole * 0.5**cuts
             target = end if abs(end - current) <= abs(increment) * (1.0 + 1e-12) else current + increment
@@ -272,7 +274,7 @@ class Equilibrium:
                         state = self.solve(state, start, start)
                         continue
                 cuts += 1
-                if cuts > self.options.max_cuts and self._rubs and self.coupled.wary:
+                if cuts > self.options.max_cuts and self._has_friction and self.coupled.wary:
                     self.coupled.wary, cuts = False, 0  # the structure may have to slide
                 elif cuts > self.options.max_cuts:
                     advice = jump_between(self.model, current, target)
@@ -303,7 +305,7 @@ class Equilibrium:
 
     def check_apart(self, state: State) -> None:
         """Refuse a start with overlapping surfaces, except for a penalty."""
-        if self.model.touch and self.model.touch.keep:
+        if self.model.touch and self.model.touch.min_separation_fraction:
             self.coupled.newton.contact.diagnosis.check(state.coupled.q)
 
     def _blocked(self, state: State, start: float, end: float) -> str:
@@ -390,7 +392,7 @@ class Equilibrium:
         try:
             state = self.coupled.solve(state, load_factor, before, increment)
         except SolverError as error:
-            goes_on = not self._rubs and (self.factors or self.model.touch is None)
+            goes_on = not self._has_friction and (self.factors or self.model.touch is None)
             if not (goes_on and error.outcome in UNFINISHED and self.coupled.arrived):
                 raise
             return self.descent.solve(error.state, load_factor)  # with second derivatives that conjugate gradients omit
@@ -411,7 +413,7 @@ class Equilibrium:
         island, q, energies = tangent.island, tangent.dofs(state), tangent.element_energies(state)
         rotations = tangent.rotations(q, modes)
         length = np.divide(FIRST_ROTATION, rotations, out=np.zeros_like(rotations), where=rotations > 0.0)
-        noise = 64 * self.model.types.eps * tangent.island_energies(np.abs(energies))
+        rounding_error = 64 * self.model.types.eps * tangent.island_energies(np.abs(energies))
         wanted = length > 0.0
 
         def moved_by(length):
@@ -425,7 +427,7 @@ class Equilibrium:
             moved = tangent.dofs(candidate)
             work = 0.5 * (tangent.loads(load_factor, q) + tangent.loads(load_factor, moved)) * (moved - q)
             change = tangent.island_energies(tangent.element_energies(candidate) - energies)
-            left = wanted & (change - np.bincount(island, work, tangent.islands) < -noise)
+            left = wanted & (change - np.bincount(island, work, tangent.islands) < -rounding_error)
             if (left | ~wanted).all():
                 return candidate, left
             length = np.where(left, length, 0.5 * length)

@@ -153,12 +153,12 @@ class Tangent:
             self.model.carry_frames(state)
 
     def friction(self, state) -> np.ndarray:
-        """Return friction forces by `state.rubbing` (size,) [N], which are not in the gradient; zero without friction."""
+        """Return friction forces by `state.slip_velocity` (size,) [N], which are not in the gradient; zero without friction."""
         result, touch = np.zeros(self.size), self.model.touch
         if touch and touch.terms.frictions:
             coupled = self.parts[-1]
             self.of(coupled, result)[:] = coupled.into(
-                touch.friction(state.coupled.q, state.rubbing, state.coupled.rate).ravel()
+                touch.friction(state.coupled.q, state.slip_velocity, state.coupled.rate).ravel()
             )
         return result
 

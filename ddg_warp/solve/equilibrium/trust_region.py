@@ -57,19 +57,24 @@ class TrustRegion:
         return np.bincount(self.island, values, self.count)
 
     def resize(
-        self, taken: np.ndarray, turn: np.ndarray, gain: np.ndarray, model: np.ndarray, noise: np.ndarray
+        self, taken: np.ndarray, turn: np.ndarray, gain: np.ndarray, model: np.ndarray, rounding_error: np.ndarray
     ) -> None:
         """Adapt the radius of every island to the accepted fraction of a step, or to actual over predicted decrease.
 
         All arguments are arrays over islands; the radius of islands with zero `taken` is unchanged.
         """
-        good = (model <= 10.0 * noise) | (gain >= 0.5 * model)
+        good = (model <= 10.0 * rounding_error) | (gain >= 0.5 * model)
         radius = np.where(good, 2.0 * self.radius, np.where(gain < 0.1 * model, 0.5 * turn, self.radius))
         radius = np.where(taken < 1.0, taken * turn, radius)
         self.radius = np.where(taken > 0.0, np.clip(radius, LEAST_RADIUS, self.cap), self.radius)
 
     def step(
-        self, hessian: sparse.csc_matrix, residual: np.ndarray, q: np.ndarray, active: np.ndarray, noise: np.ndarray
+        self,
+        hessian: sparse.csc_matrix,
+        residual: np.ndarray,
+        q: np.ndarray,
+        active: np.ndarray,
+        rounding_error: np.ndarray,
     ) -> np.ndarray:
         """Return the step on the free dofs (size,) of `active` islands, zero elsewhere.
 
@@ -80,7 +85,7 @@ class TrustRegion:
         """
         direction, turn = self._shifted(hessian, residual, q, active)
         short = active & (self.shift > 0.0) & (turn < SHORT * self.radius) & np.isfinite(self.radius)
-        return self._further(hessian, residual, direction, q, short, noise) if short.any() else direction
+        return self._further(hessian, residual, direction, q, short, rounding_error) if short.any() else direction
 
     def _shifted(self, hessian, residual, q, active) -> tuple[np.ndarray, np.ndarray]:
         """Return the step of least shift, see the module, and its rotation; the search starts below the last shift."""
@@ -156,7 +161,7 @@ class TrustRegion:
             for index in np.flatnonzero(islands):
                 yield from self._factors(hessian, shift, np.arange(self.count) == index)
 
-    def _further(self, hessian, residual, direction, q, islands, noise) -> np.ndarray:
+    def _further(self, hessian, residual, direction, q, islands, rounding_error) -> np.ndarray:
         """Extend a step shorter than the radius along the mode of least stiffness, if negative.
 
         This is the hard case of More and Sorensen: without force along that mode, as by symmetry, a step never leaves the symmetric
@@ -180,7 +185,7 @@ class TrustRegion:
             distance = np.where(islands & (rotations > 0.0), self.radius / rotations, 0.0)
         curvature = self.sums(mode * (hessian @ mode))
         gain = self.sums(residual * direction) - 0.5 * self.sums(direction * (hessian @ direction))
-        chosen = islands & (-0.5 * distance**2 * curvature > np.maximum(gain, 100.0 * noise))
+        chosen = islands & (-0.5 * distance**2 * curvature > np.maximum(gain, 100.0 * rounding_error))
         sense = np.where(self.sums(direction * (metric @ mode)) >= 0.0, 1.0, -1.0)
         return direction + (np.where(chosen, sense * distance, 0.0))[self.island] * mode
 

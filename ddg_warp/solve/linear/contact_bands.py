@@ -11,28 +11,37 @@ class ContactBands:
     """Bands of the rod paths, with contact added.
 
     Args:
-        `chains`: with its plan bound; shapes: collision mesh.
+        `substructuring`: with its plan bound; shapes: collision mesh.
     """
 
-    def __init__(self, chains, shapes):
-        self.chains, self._edges = chains, len(shapes.things(2)[0])
-        next_edge = _following_edges(shapes, chains.plan, chains.coupled.blocks)
-        angle_edge = _turning(shapes, chains.plan, chains.coupled.blocks)
-        self._stiffen = stiffen_kernel(chains.plan.twist, chains.bands.blocks.dtype, bool((angle_edge >= 0).any()))
+    def __init__(self, substructuring, shapes):
+        self.substructuring, self._edges = substructuring, len(shapes.primitives(2)[0])
+        next_edge = _following_edges(shapes, substructuring.plan, substructuring.coupled.blocks)
+        angle_edge = _turning(shapes, substructuring.plan, substructuring.coupled.blocks)
+        self._stiffen = stiffen_kernel(
+            substructuring.plan.twist, substructuring.bands.blocks.dtype, bool((angle_edge >= 0).any())
+        )
         self.kernels = [self._stiffen]
         self._ahead, self._turning = (
-            device_arrays.upload(edges, int, chains.device) for edges in (next_edge, angle_edge)
+            device_arrays.upload(edges, int, substructuring.device) for edges in (next_edge, angle_edge)
         )
 
     def __call__(self, terms, flags: wp.array) -> None:
         """Write the sum of the bands and the blocks that `ContactPotential.join` has assembled, in worlds whose flags want a
         direction.
         """
-        chains = self.chains
-        inputs = [chains.bands.blocks, chains.paths.layout, self._ahead, self._edges, flags, chains.coupled.blocks]
+        substructuring = self.substructuring
+        inputs = [
+            substructuring.bands.blocks,
+            substructuring.paths.layout,
+            self._ahead,
+            self._edges,
+            flags,
+            substructuring.coupled.blocks,
+        ]
         inputs += [terms.blocks.diagonal, terms.blocks.between, self._turning, *terms.blocks.turned]
-        dim = chains.paths.longest, chains.paths.columns
-        wp.launch(self._stiffen, dim, inputs, [chains.bands.eliminated], device=chains.device)
+        dim = substructuring.paths.longest, substructuring.paths.columns
+        wp.launch(self._stiffen, dim, inputs, [substructuring.bands.eliminated], device=substructuring.device)
 
 
 def _turning(shapes, plan, blocks: int) -> np.ndarray:
@@ -45,10 +54,10 @@ def _turning(shapes, plan, blocks: int) -> np.ndarray:
 
 def _following_edges(shapes, plan, blocks: int) -> np.ndarray:
     """Return the collision edge from the node of each path node to the next one; -1 for none."""
-    ends, *_ = shapes.things(2)
+    ends, *_ = shapes.primitives(2)
     node = plan.places[0]
     next_node = np.full_like(node, -1)
-    next_node[:-1] = np.where(plan.chain[1:] == plan.chain[:-1], node[1:], -1)
+    next_node[:-1] = np.where(plan.path[1:] == plan.path[:-1], node[1:], -1)
     keys = ends[:, 0].astype(np.int64) * blocks + ends[:, 1]
     order = np.argsort(keys)
     wanted = node.astype(np.int64) * blocks + next_node

@@ -20,9 +20,9 @@ class ContactHessian:
         self._terms, self._shapes, self.diagonal = terms, shapes, terms.blocks.diagonal
         self._bands = self._q = self._curved = None
 
-    def bind(self, chains) -> None:
+    def bind(self, substructuring) -> None:
         """Add contact to the bands of a bound `RodSubstructuring` from now on."""
-        self._bands = ContactBands(chains, self._shapes)
+        self._bands = ContactBands(substructuring, self._shapes)
 
     @property
     def kernels(self) -> list:

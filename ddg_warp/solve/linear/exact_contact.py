@@ -17,10 +17,10 @@ class ExactContact:
     """
 
     def __init__(self, coupled):
-        self.coupled, contact = coupled, coupled.host.touching
+        self.coupled, contact = coupled, coupled.host.contact_parameters
         obstacle_nodes = coupled.host.of_obstacles  # their rows of H do not count
         self.touch = ContactModel(
-            coupled, wp.float64, coupled.rest().q, obstacle_nodes, MARGIN * contact.reach, exact=True
+            coupled, wp.float64, coupled.rest().q, obstacle_nodes, MARGIN * contact.search_distance, exact=True
         )
         self.search, self.terms = self.touch.search, self.touch.terms
         self.hessian = ContactHessian(self.terms, self.touch.shapes)

@@ -51,17 +51,17 @@ class ExactSystem:
             return wp.zeros(shape, dtype=dtype, device=device)
 
         preconditioner, drag = coupled_preconditioner(coupled), inertia is not None
-        self.chains = RodSubstructuring.of(coupled, preconditioner, banded=False)
+        self.substructuring = RodSubstructuring.of(coupled, preconditioner, banded=False)
         self.sparsity = SparseSystem(coupled)
         self.planes = SkewSupports(coupled, self.sparsity, real, self.linear) if host.frames else None
-        if self.chains:
-            self.chains.bind(self.sparsity, [], self.linear, (), drag)
+        if self.substructuring:
+            self.substructuring.bind(self.sparsity, [], self.linear, (), drag)
             if contact:
-                contact.hessian.bind(self.chains)
+                contact.hessian.bind(self.substructuring)
         self.mass = inertia if drag else coupled.mass
         self.islands = Islands(worlds, real, device)
         wanted = self.islands.needs_direction
-        self.system = LinearSystem.of(coupled, self.sparsity, self.chains, self.linear, wanted, wanted)
+        self.system = LinearSystem.of(coupled, self.sparsity, self.substructuring, self.linear, wanted, wanted)
         self.failed = make(worlds, int)
         self._begin, self._add = exact_kernels(real, self.linear, drag, device_arrays.serial(device))
         self._into, self._back, self._keep = block_kernels(real, self.linear)
@@ -76,12 +76,14 @@ class ExactSystem:
         self._no_stress = make((0, 0), real)
         self._ends = [wp.array(_ends(part.term.measure), dtype=int, device=device) for part in coupled.sets]
         multilevel, hessian = preconditioner.endswith("multilevel"), contact and contact.hessian
-        self.krylov = PCG(coupled, self.sparsity, self.chains, hessian, self.linear, multilevel, indefinite=True)
+        self.krylov = PCG(
+            coupled, self.sparsity, self.substructuring, hessian, self.linear, multilevel, indefinite=True
+        )
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        used = [part.kernels for part in (self.krylov, self.chains, self.planes, self.contact) if part]
+        used = [part.kernels for part in (self.krylov, self.substructuring, self.planes, self.contact) if part]
         result = [self._begin, self._add, self._into, self._back, self._keep, self._rest, self._check]
         return [*result, *self._hessians, *(kernel for kernels in used for kernel in kernels)]
 
@@ -136,8 +138,8 @@ class ExactSystem:
             self._launch(self._add, every, read, [system.matrix])
         if self.planes:
             self.planes.matrix(system.matrix, system.wanted)
-        if self.chains:
-            self.chains.bands.assemble(system.matrix, self.mass, self.islands)
+        if self.substructuring:
+            self.substructuring.bands.assemble(system.matrix, self.mass, self.islands)
         if self.contact:
             self.contact.hessian.assemble()
             self.contact.hessian.add_to_bands(flags)

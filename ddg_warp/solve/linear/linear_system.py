@@ -74,7 +74,14 @@ class LinearSystem:
 
     @classmethod
     def of(
-        cls, coupled, sparsity, chains, linear, wanted: wp.array, outdated: wp.array, indefinite: wp.array | None = None
+        cls,
+        coupled,
+        sparsity,
+        substructuring,
+        linear,
+        wanted: wp.array,
+        outdated: wp.array,
+        indefinite: wp.array | None = None,
     ) -> "LinearSystem":
         """Return systems in the scalar type `linear`, of a `SparseSystem` and a bound `RodSubstructuring` or None.
 
@@ -90,7 +97,7 @@ class LinearSystem:
             rhs=make(worlds * blocks, vector),
             direction=make(worlds * blocks, vector),
             dots=make((worlds, blocks), linear),
-            masks=DofMasks.of(coupled, chains and chains.paths.idle),
+            masks=DofMasks.of(coupled, substructuring and substructuring.paths.idle),
             wanted=wanted,
             outdated=outdated,
             iterations=make(worlds, int),

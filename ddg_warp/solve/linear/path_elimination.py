@@ -37,8 +37,8 @@ class PathElimination:
             self._all = wp.array(counts.astype(np.int32), dtype=int, device=device)
             self._wanted, self._bad = (wp.zeros(paths.columns, dtype=int, device=device) for _ in range(2))
         elif serial and not joints:
-            self._sweep = rod_substructuring.serial_path_nodes_kernel(plan.twist, plan.span, linear, plan.split)
-        elif not (joints or plan.split):
+            self._sweep = rod_substructuring.serial_path_nodes_kernel(plan.twist, plan.span, linear, plan.mixed_axial)
+        elif not (joints or plan.mixed_axial):
             self._twisted = TwistedFactorisation(plan, paths.columns, linear, device, SERIAL)
         self._twist = plan.twist
         # True if further right-hand sides involve rod paths alone

@@ -78,8 +78,8 @@ class PathJoints:
 
     def _inputs(self, values: wp.array) -> list:
         paths = self.paths
-        chains = [*self._of_joints, values, paths.where, paths.width, self.coupled.host.nodes]
-        return [self.sparsity.columns, *chains, self._pairs]
+        joint_inputs = [*self._of_joints, values, paths.where, paths.width, self.coupled.host.nodes]
+        return [self.sparsity.columns, *joint_inputs, self._pairs]
 
     def _right_hand_sides(self, system, wanted: wp.array, values: wp.array, residual, moved) -> None:
         """Write r_I - H_IJ z_J, for one joint movement or all; None for `residual` or `moved` means zero."""

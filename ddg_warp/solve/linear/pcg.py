@@ -36,7 +36,7 @@ class PCG:
     """Preconditioned conjugate gradients for `LinearSystem`s, to the forcing term in the preconditioner norm.
 
     Args:
-        `sparsity`: `SparseSystem` of H; `chains`: `RodSubstructuring` of the preconditioner or None, with blocks of H in bands.
+        `sparsity`: `SparseSystem` of H; `substructuring`: `RodSubstructuring` of the preconditioner or None, with blocks of H in bands.
         contact: `ContactHessian` to add to H, or None.
         linear: scalar type of the systems.
         multilevel: True to add BPX multilevel corrections, or to use these alone; see `kernels.linear.multilevel`.
@@ -53,10 +53,18 @@ class PCG:
     """
 
     def __init__(
-        self, coupled, sparsity, chains, contact, linear, multilevel: bool, indefinite: bool = False, scale: float = 1.0
+        self,
+        coupled,
+        sparsity,
+        substructuring,
+        contact,
+        linear,
+        multilevel: bool,
+        indefinite: bool = False,
+        scale: float = 1.0,
     ):
         self._scale, self._unit = linear(scale), linear(1.0 / scale)
-        self.coupled, self.sparsity, self.chains, self.contact = coupled, sparsity, chains, contact
+        self.coupled, self.sparsity, self.substructuring, self.contact = coupled, sparsity, substructuring, contact
         worlds, count, device = coupled.worlds, coupled.worlds * coupled.blocks, coupled.device
         H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
         self.rest, self.z, self.p, self.product = (wp.zeros(count, dtype=H, device=device) for _ in range(4))
@@ -103,8 +111,8 @@ class PCG:
             [system.rhs, self.inverse, table.diagonal, masks.inactive, system.wanted, blocks, self._scale],
             [self.rest, system.direction, self.p, system.dots],
         )
-        if self.chains:
-            self.chains.prepare(system, self._unread[0])
+        if self.substructuring:
+            self.substructuring.prepare(system, self._unread[0])
         if self.levels:
             self.levels.prepare(system, self._more, iteration)
         self.precondition(system, self.p)
@@ -126,8 +134,8 @@ class PCG:
     @timer("preconditioner")
     def precondition(self, system, z: wp.array) -> None:
         """Apply substructuring and multilevel to z, on entry the residual times inverse diagonal blocks; write r . z."""
-        if self.chains:
-            self.chains.apply(system, self.rest, z, self._unread[0])
+        if self.substructuring:
+            self.substructuring.apply(system, self.rest, z, self._unread[0])
         if self.levels:
             self.levels.apply(self.rest, system.masks.inactive, system.wanted, z, system.dots)
 
@@ -157,8 +165,8 @@ class PCG:
     @timer("product")
     def multiply(self, system, p: wp.array) -> None:
         """Write H p on active dofs, and p . H p block by block; no matrix has the contact terms."""
-        if self.chains and self.chains.banded:  # elements along rods are stored in bands
-            elements = partial(self.chains.bands.product, system, p, self.product)
+        if self.substructuring and self.substructuring.banded:  # elements along rods are stored in bands
+            elements = partial(self.substructuring.bands.product, system, p, self.product)
         else:
             elements = partial(self.multiply_matrix, system, p)
         if not self.contact:
@@ -192,7 +200,7 @@ class NewtonPCG(PCG):
         self,
         coupled,
         sparsity,
-        chains,
+        substructuring,
         contact,
         linear,
         multilevel: bool,
@@ -202,7 +210,7 @@ class NewtonPCG(PCG):
         keeps_levels: bool,
     ):
         self.scale, real = natural_scale(coupled), coupled.real
-        super().__init__(coupled, sparsity, chains, contact, linear, multilevel, scale=self.scale)
+        super().__init__(coupled, sparsity, substructuring, contact, linear, multilevel, scale=self.scale)
         self._tolerances, self._rtol, self._relaxed = tolerances, rtol, relaxed
         self._keeps_levels = keeps_levels
         self._largest = Sums(coupled.worlds, tolerances.ratio.shape[1], real, coupled.device, largest=True)

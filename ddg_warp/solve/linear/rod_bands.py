@@ -30,7 +30,7 @@ class RodBands:
         self, coupled, plan, paths, sparsity, written, linear, exact_from, drag, banded: bool, exact: bool, factors
     ):
         self.coupled, self.paths, self.sparsity, real = coupled, paths, sparsity, coupled.real
-        device, contact, size = coupled.device, coupled.host.touching is not None, 3 * plan.block**2
+        device, contact, size = coupled.device, coupled.host.contact_parameters is not None, 3 * plan.block**2
         self.blocks = paths.allocate(size, linear) if factors is None else factors
         self.eliminated = paths.allocate(size, linear) if contact and banded else self.blocks
         along = [i for i, part in enumerate(coupled.sets) if part.host.along and banded]
@@ -41,10 +41,10 @@ class RodBands:
         self.sets = wp.array(self._of_sets, dtype=along_struct, device=device)
         serial = device_arrays.serial(device)
         self._assemble, self._clear, self._product = rod_bands.band_kernels(
-            self.terms, plan.twist, plan.span, real, linear, self.exact_from, drag, serial, plan.split
+            self.terms, plan.twist, plan.span, real, linear, self.exact_from, drag, serial, plan.mixed_axial
         )
         if serial:
-            self._product = rod_bands.product_walk_kernel(plan.twist, plan.span, linear, plan.split)
+            self._product = rod_bands.product_walk_kernel(plan.twist, plan.span, linear, plan.mixed_axial)
         self._taken = wp.array(plan.taken.astype(np.int32), dtype=int, device=device)
         self._clears = banded and not exact and plan.taken.size > 0  # for products with all of H
         self._at_none = wp.array(np.flatnonzero(plan.where < 0).astype(np.int32), dtype=int, device=device)
@@ -57,7 +57,7 @@ class RodBands:
         )
         self._multiplies = banded and not exact
         self.longer = self._lengthen = None
-        if plan.split:
+        if plan.mixed_axial:
             self.longer = paths.allocate(2, linear)
             self._lengthen = rod_bands.lengthen_kernel(self.terms, real, linear)
 

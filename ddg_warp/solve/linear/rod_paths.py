@@ -11,7 +11,7 @@ class RodPaths:
     """Rod paths of a bound `SubstructuringPlan`, in columns of all worlds. Unnamed shapes: see the plan.
 
     Attributes:
-        `places`, `chain`: blocks of every path node, and its path.
+        `places`, `path`: blocks of every path node, and its path.
         `count`: path nodes of the columns of a world; `where`: (blocks,) path node of every block.
         `held`: bits of fixed dofs of path nodes.
         idle: (columns,) nonzero for paths without active dofs in a direction, see `DofMasks`.
@@ -26,13 +26,13 @@ class RodPaths:
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
 
         self.places = device_arrays.upload(plan.places.astype(np.int32), int, device)
-        self.chain, self.count, self.where = put(plan.chain), put(plan.count), put(plan.where)
+        self.path, self.count, self.where = put(plan.path), put(plan.count), put(plan.where)
         self.held = device_arrays.upload(plan.held(coupled.host), wp.uint8, device)
-        self.longest, self.width = plan.chain.shape
+        self.longest, self.width = plan.path.shape
         self.columns = coupled.worlds * self.width
         self.idle = wp.zeros(self.columns, dtype=int, device=device)
         self.layout = layout_type()()
-        for name in ("places", "chain", "count", "held", "idle"):
+        for name in ("places", "path", "count", "held", "idle"):
             setattr(self.layout, name, getattr(self, name))
         self.layout.diagonal, self.layout.positions = sparsity.diagonal, sparsity.positions
 

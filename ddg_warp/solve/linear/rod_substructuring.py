@@ -22,7 +22,7 @@ class RodSubstructuring:
     Args:
         coupled: the `CoupledModel`.
         banded: True to store blocks of H between path nodes in bands here, instead of among the positions of a `SparseSystem`.
-        split: True for edge tensions as unknowns, see `kernels.linear.mixed_axial_force`; allowed if `splits`.
+        mixed_axial: True for edge tensions as unknowns, see `kernels.linear.mixed_axial_force`; allowed if `allows_mixed_axial`.
 
     Attributes:
         paths, bands: `RodPaths` and `RodBands`, after `bind`.
@@ -32,24 +32,26 @@ class RodSubstructuring:
         SceneError: the coupled system has no rods.
     """
 
-    def __init__(self, coupled, banded: bool, split: bool = False):
+    def __init__(self, coupled, banded: bool, mixed_axial: bool = False):
         if not coupled.host.rods:
-            raise SceneError("preconditioner 'chain' is for coupled systems with rods; this one has none")
-        self.coupled, self.device, self.split = coupled, coupled.device, split
-        self.plan = SubstructuringPlan(coupled.host, split)
+            raise SceneError("preconditioner 'substructuring' is for coupled systems with rods; this one has none")
+        self.coupled, self.device, self.mixed_axial = coupled, coupled.device, mixed_axial
+        self.plan = SubstructuringPlan(coupled.host, mixed_axial)
         self.banded = banded and sum(part.host.along for part in coupled.sets) <= SETS
         self.kept = self.plan.where >= 0 if self.banded else None
-        self._contact = coupled.host.touching is not None
+        self._contact = coupled.host.contact_parameters is not None
 
     @classmethod
-    def of(cls, coupled, preconditioner: str, banded: bool = True, split: bool = False) -> "RodSubstructuring | None":
+    def of(
+        cls, coupled, preconditioner: str, banded: bool = True, mixed_axial: bool = False
+    ) -> "RodSubstructuring | None":
         """Return the substructuring of a preconditioner, in bands if possible; None for preconditioners without substructuring."""
-        if preconditioner not in ("chain", "chain_multilevel"):
+        if preconditioner not in ("substructuring", "substructuring_multilevel"):
             return None
-        return cls(coupled, banded and preconditioner == "chain" and not coupled.host.frames, split)
+        return cls(coupled, banded and preconditioner == "substructuring" and not coupled.host.frames, mixed_axial)
 
     @property
-    def splits(self) -> bool:
+    def allows_mixed_axial(self) -> bool:
         """True if edge tensions may be unknowns, once the plan is bound: only rod paths without joints, one thread a path.
 
         Alternative: edge tensions as unknowns between moving joints.
@@ -57,9 +59,9 @@ class RodSubstructuring:
         Measured: as accurate as float64, 5 to 17 % slower on an H200 and 1.2 to 2 times slower on a CPU core.
         Scenes: gridshells of 8 edges, EA L^2 / EI = 1e8, and hair with twigs, where 1/60 s took 11 iterations instead of 7.
         """
-        longest, width = self.plan.chain.shape
+        longest, width = self.plan.path.shape
         few = long_and_few(longest, self.coupled.worlds * width, wp.get_device(self.device))
-        return self.split or (self.banded and self.plan.alone and not (few or self._contact))
+        return self.mixed_axial or (self.banded and self.plan.joins_paths_only and not (few or self._contact))
 
     def bind(self, sparsity, written: list[dict], linear, exact_from: tuple, drag: bool, reuse: bool = False) -> None:
         """Bind the `SparseSystem`, without entries stored in bands, and the element outputs of all sets; see `MatrixAssembly`.
@@ -71,11 +73,11 @@ class RodSubstructuring:
         self.exact = self.banded and plan.complete and not self._contact
         self.paths = paths = RodPaths(coupled, plan, sparsity)
         serial = device_arrays.serial(self.device)
-        made = path_kernels(plan.twist, plan.span, linear, plan.size, serial, self.split)
+        made = path_kernels(plan.twist, plan.span, linear, plan.size, serial, self.mixed_axial)
         factorise, load, solve, solve_all, follow, finish, *columns = made
         self._joints = PathJoints(coupled, plan, paths, sparsity, linear, (load, follow, finish))
         reduces = long_and_few(paths.longest, paths.columns, wp.get_device(self.device), self._contact)
-        reduces, repeated = reduces and not self.split, not self.exact or self._joints.linked
+        reduces, repeated = reduces and not self.mixed_axial, not self.exact or self._joints.linked
         kernels = factorise, solve, solve_all, *columns
         self._elimination = PathElimination(coupled, plan, paths, linear, kernels, reduces, repeated)
         in_place = reduces or self.exact or not self.banded  # the blocks are not needed after factorisation
@@ -83,7 +85,7 @@ class RodSubstructuring:
         outputs = written, linear, exact_from, drag
         self.bands = RodBands(coupled, plan, paths, sparsity, *outputs, self.banded, self.exact, factors)
         self._walk = None
-        if self.exact and serial and not (reduces or reuse or self.split):
+        if self.exact and serial and not (reduces or reuse or self.mixed_axial):
             of_terms = self.bands.terms, plan.twist, plan.span, coupled.real, linear, self.bands.exact_from
             self._walk = walk_kernel(*of_terms, drag, self._joints.count > 0)
 

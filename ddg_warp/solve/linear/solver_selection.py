@@ -26,13 +26,13 @@ LONGEST_REPEATED = 8192
 # 1.2 of the time.
 LARGE, LARGE_IN_CONTACT = 1024, 4096
 
-# Substructuring of rods (preconditioner `"chain"`) against block Jacobi, see `coupled_preconditioner`. BETWEEN: nodes of a rod between
-# joints from which substructuring pays. The time unit is a block Jacobi iteration on a GPU: a path node takes 1 / `PATH_NODES`, the
-# remaining launches `LAUNCHES`. A cyclic reduction of few, long paths takes as much as REDUCED path nodes.
-#
-# Measured: iterations of block Jacobi grow with the square of the edges between joints (gridshell, residual 1e-3: 250 at 8 edges, 2378
-# at 32). Substructuring takes 16 at any number, at about twice the time each on the CPU. On a GPU a rod path is serial: an iteration of
-# block Jacobi takes 41 us on an H200, with rod paths of 8, 32 and 128 nodes 84, 144 and 330 us (tools/results/nets_cuda.csv).
+# Substructuring of rods (preconditioner `"substructuring"`) against block Jacobi, see `coupled_preconditioner`. BETWEEN: nodes of a
+# rod between joints from which substructuring pays. The time unit is a block Jacobi iteration on a GPU: a path node takes 1 /
+# `PATH_NODES`, the remaining launches `LAUNCHES`. A cyclic reduction of few, long paths takes as much as REDUCED path nodes.
+# Measured: iterations of block Jacobi grow with the square of the edges between joints (gridshell, residual 1e-3: 250 at 8 edges,
+# 2378 at 32). Substructuring takes 16 at any number, at about twice the time each on the CPU. On a GPU a rod path is serial: an
+# iteration of block Jacobi takes 41 us on an H200, with rod paths of 8, 32 and 128 nodes 84, 144 and 330 us
+# (tools/results/nets_cuda.csv).
 BETWEEN = 4
 PATH_NODES = 20
 REDUCED = 240
@@ -40,9 +40,9 @@ LAUNCHES = 1
 
 
 def automatic(group) -> str:
-    """Return the linear solver of a rod group: `"partitioned"` for few, long, open rods on CUDA, or `"sweep"`."""
+    """Return the linear solver of a rod group: `"cyclic_reduction"` for few, long, open rods on CUDA, or `"sweep"`."""
     few = not group.kind.closed and long_and_few(group.nodes, group.columns, group.device)
-    return "partitioned" if few else "sweep"
+    return "cyclic_reduction" if few else "sweep"
 
 
 def long_and_few(nodes: int, columns: int, device, repeated: bool = False) -> bool:
@@ -66,7 +66,7 @@ LARGE_STATIC = {False: 50_000, True: 4_000}
 def static_solver(model) -> str:
     """Return the static solver: "pcg" for contact and for large supported coupled systems, else "direct"."""
     coupled = model.coupled
-    if coupled is not None and coupled.host.touching:
+    if coupled is not None and coupled.host.contact_parameters:
         return "pcg"
     if coupled is None or why_not_pcg(model):
         return "direct"
@@ -86,9 +86,12 @@ def why_not_pcg(model) -> str:
 
 
 def coupled_preconditioner(coupled) -> str:
-    """Return the preconditioner: `"chain"` for rods long between joints, `"multilevel"` for large systems, both, or block Jacobi."""
+    """Return the preconditioner:
+
+    `"substructuring"` for rods long between joints, `"multilevel"` for large systems, both, or block Jacobi.
+    """
     host = coupled.host
-    large = LARGE_IN_CONTACT if host.touching else LARGE
+    large = LARGE_IN_CONTACT if host.contact_parameters else LARGE
     if not host.rods:
         return "multilevel" if host.nodes >= large else "block_jacobi"
     rod_nodes = np.concatenate([rod.all_nodes for rod in host.rods])
@@ -103,7 +106,7 @@ def coupled_preconditioner(coupled) -> str:
         reduced = long_and_few(places, len(host.rods) * coupled.worlds, coupled.device)
         pays = 0.25 * between**2 > LAUNCHES + (min(places, REDUCED) if reduced else places) / PATH_NODES
     rest = host.nodes - len(np.unique(rod_nodes)) if pays else host.nodes
-    names = ["chain"] * pays + ["multilevel"] * (rest >= large)
+    names = ["substructuring"] * pays + ["multilevel"] * (rest >= large)
     return "_".join(names) or "block_jacobi"
 
 

@@ -16,11 +16,12 @@ class SubstructuringPlan:
     other in columns as long as the longest path, so that little memory is padding. Fixed nodes are left out.
 
     Args:
-        split: True if path nodes have the tension of the edge before them; a path then extends to the joint where its last edge ends.
+        mixed_axial: True if path nodes have the tension of the edge before them; a path then extends to the joint where its last
+            edge ends.
 
     Attributes:
         `twist`, `span`: whether paths have twist angles; number of path nodes over which they couple.
-        `chain` (longest, columns): number of the path at a path node, -1 in the padding.
+        `path` (longest, columns): number of the path at a path node, -1 in the padding.
         `count` (columns,): path nodes of a column.
         `where` (blocks,): path node * columns + column of a block, -1 for none.
         `pairs` (joints, 2): blocks of a joint, -1 for none.
@@ -41,8 +42,8 @@ class SubstructuringPlan:
             meets one, or if one path meets two of one colour.
     """
 
-    def __init__(self, host, split: bool = False):
-        self.split = split
+    def __init__(self, host, mixed_axial: bool = False):
+        self.mixed_axial = mixed_axial
         self._blocks, self._held = host.blocks, host.fixed.all(1)
         lengths = [len(rod.all_nodes) for rod in host.rods]
         self._first = dict(zip((rod.rod for rod in host.rods), np.cumsum([0, *lengths[:-1]]), strict=True))
@@ -55,25 +56,27 @@ class SubstructuringPlan:
         node, angle = (np.where((block >= 0) & ~self._out[block], block, -1) for block in (node, angle))
         kept = (node >= 0) | (angle >= 0)
         if not kept.any():
-            raise SceneError("preconditioner 'chain': no rod of the coupled system has a node between its joints")
+            raise SceneError(
+                "preconditioner 'substructuring': no rod of the coupled system has a node between its joints"
+            )
         continues = np.zeros(len(node), bool)  # continues the path of the previous path node
         for step in (1, 2):
             continues[later_node[distance == 2] - step + 1] = True
         continues[later_node[distance == 1]] = True
-        if split:
+        if mixed_axial:
             continues[1:] |= (kept | continues)[:-1] & (rod[1:] == rod[:-1])
         kept |= continues  # also path nodes without dofs within a path
-        chain = np.cumsum(~continues)[kept]
+        path = np.cumsum(~continues)[kept]
         self.twist, self.span = bool((angle >= 0).any()), 2 if (distance == 2).any() else 1
-        self._arrange(kept, node[kept], angle[kept], np.unique(chain, return_inverse=True)[1])
+        self._arrange(kept, node[kept], angle[kept], np.unique(path, return_inverse=True)[1])
 
     @property
     def block(self) -> int:
         """Number of dofs of a path node."""
-        return path_node_dofs(self.twist, self.split)
+        return path_node_dofs(self.twist, self.mixed_axial)
 
     @property
-    def alone(self) -> bool:
+    def joins_paths_only(self) -> bool:
         """True if the elimination solves all of H and no path meets a joint, so that each tension belongs to one path."""
         return self.complete and not len(self.of_places[1])
 
@@ -92,15 +95,15 @@ class SubstructuringPlan:
         self._keys = rows[self._order].astype(np.int64) * host.blocks + columns[self._order]
         self._positions()
         self._couple(host, np.where(near, rows, -1), columns)
-        chains = self._colour(host, columns)
+        paths = self._colour(host, columns)
         self._take(rows, columns, near, kept)
-        self.complete &= not (np.bincount(chains) > 1).any()
+        self.complete &= not (np.bincount(paths) > 1).any()
 
     def elements(self, host, element_set) -> np.ndarray:
         """Return the elements with node i at a path node (nodes, longest, columns), -1 for none."""
         rod, k = element_set.owner
         first, n = (np.array([table[r] for r in rod.tolist()], int) for table in (self._first, self._length))
-        result = np.full((element_set.term.measure.nodes, *self.chain.shape), -1)
+        result = np.full((element_set.term.measure.nodes, *self.path.shape), -1)
         for i, elements in enumerate(result):
             row, column = self._at[:, first + (k + i) % n]
             present = row >= 0
@@ -115,7 +118,7 @@ class SubstructuringPlan:
 
     def held(self, host) -> np.ndarray:
         """Return a bit mask of the fixed or absent dofs of path nodes (longest, columns)."""
-        result = np.zeros(self.chain.shape, np.uint8)
+        result = np.zeros(self.path.shape, np.uint8)
         for blocks, components in zip(self.places[: len(self._dofs)], (3, 1), strict=False):
             missing = (blocks < 0)[..., None] | host.fixed[blocks, :components]
             result |= (missing << (3 * (components == 1) + np.arange(components))).sum(-1).astype(np.uint8)
@@ -164,9 +167,9 @@ class SubstructuringPlan:
         remaining = ~(np.isin(a, cut) | np.isin(b, cut))
         return a[remaining], (a - b)[remaining]
 
-    def _arrange(self, kept, node, angle, chain) -> None:
-        """Arrange paths in columns: `chain`, `count` and `where`."""
-        lengths = np.bincount(chain)
+    def _arrange(self, kept, node, angle, path) -> None:
+        """Arrange paths in columns: `path`, `count` and `where`."""
+        lengths = np.bincount(path)
         begin, column = np.zeros(len(lengths), int), np.zeros(len(lengths), int)
         filled, longest = [0], lengths.max()
         for i in np.argsort(-lengths, kind="stable"):
@@ -176,37 +179,37 @@ class SubstructuringPlan:
             filled[-1] += lengths[i]
         self.count = np.array(filled)
         width = len(filled)
-        k = np.arange(len(node)) - np.repeat(np.cumsum(lengths) - lengths, lengths) + begin[chain]
+        k = np.arange(len(node)) - np.repeat(np.cumsum(lengths) - lengths, lengths) + begin[path]
         self._at = np.full((2, len(kept)), -1)
-        self._at[:, kept] = k, column[chain]
+        self._at[:, kept] = k, column[path]
         self._dofs = [node, angle] if self.twist else [node]
-        self._chains, self._k, self._c = chain, k, column[chain]
+        self._path_of, self._k, self._c = path, k, column[path]
         self.where = np.full(self._blocks, -1)
         for block in self._dofs:
             self.where[block[block >= 0]] = (k * width + self._c)[block >= 0]
-        self.chain = np.full((longest, width), -1)
-        self.chain[k, self._c] = chain
+        self.path = np.full((longest, width), -1)
+        self.path[k, self._c] = path
 
     def _positions(self) -> None:
         """Find blocks of path nodes and positions of couplings: `places`."""
         rows, positions = list(self._dofs), []
         for s in range(self.span + 1):
-            together = np.append(self._chains[s:] == self._chains[: len(self._chains) - s], np.zeros(s, bool))
+            together = np.append(self._path_of[s:] == self._path_of[: len(self._path_of) - s], np.zeros(s, bool))
             for p in self._dofs:
                 for q in self._dofs:
                     positions.append(self.find(p, np.where(together, np.roll(q, -s), -1)))
         rows += positions if any((each >= 0).any() for each in positions) else []
-        self.places = np.full((len(rows), *self.chain.shape), -1)
+        self.places = np.full((len(rows), *self.path.shape), -1)
         self.places[:, self._k, self._c] = rows
 
     def _take(self, rows, columns, near, kept) -> None:
         """Find the positions that bands replace (`taken`), and whether they solve all of H (`complete`)."""
-        k, c = np.divmod(self.where, self.chain.shape[1])
+        k, c = np.divmod(self.where, self.path.shape[1])
         a, b = (np.where(rows >= 0, blocks, 0) for blocks in (rows, columns))
         inside, free = self.where >= 0, ~self._held
         both = inside[a] & inside[b] & (rows >= 0) & free[a] & free[b]
         same = both & near & (c[a] == c[b]) & (np.abs(k[a] - k[b]) <= self.span)
-        same &= self.chain[k[a], c[a]] == self.chain[k[b], c[b]]
+        same &= self.path[k[a], c[a]] == self.path[k[b], c[b]]
         self.taken = np.zeros(0, int) if kept is None else np.flatnonzero(same)
         joint = np.where(self.joint_row >= 0, self.joint_row // 2, -1)
         between = (joint[a] != joint[b]) & (rows >= 0) & free[a] & free[b] & ~(inside[a] | inside[b])
@@ -235,7 +238,7 @@ class SubstructuringPlan:
         joints = len(self.pairs)
         starts, items = self.of_joints
         joint = np.repeat(np.arange(2 * joints), np.diff(starts)) // 2
-        k, column = np.divmod(self.where[columns[items]], self.chain.shape[1])
+        k, column = np.divmod(self.where[columns[items]], self.path.shape[1])
         meetings = np.unique(np.column_stack([column, k, joint]), axis=0)
         neighbours = [set() for _ in range(joints)]
         for lag in (1, 2, 3):
@@ -247,23 +250,21 @@ class SubstructuringPlan:
         for m in range(joints):
             taken = {self.colour[neighbour] for neighbour in neighbours[m]}
             self.colour[m] = next(c for c in range(joints) if c not in taken)
-        chain, joint = np.unique(
-            np.column_stack([self.chain[meetings[:, 1], meetings[:, 0]], meetings[:, 2]]), axis=0
-        ).T
+        path, joint = np.unique(np.column_stack([self.path[meetings[:, 1], meetings[:, 0]], meetings[:, 2]]), axis=0).T
         colours = self.colour.max(initial=-1) + 1
-        joints_of = np.full((colours, self.chain.max() + 1), -1)
-        joints_of[self.colour[joint], chain] = joint
-        alone = np.unique(chain * colours + self.colour[joint]).size == chain.size
-        self.met = np.where(self.chain >= 0, joints_of[:, self.chain], -1) if len(chain) and alone else None
+        joints_of = np.full((colours, self.path.max() + 1), -1)
+        joints_of[self.colour[joint], path] = joint
+        alone = np.unique(path * colours + self.colour[joint]).size == path.size
+        self.met = np.where(self.path >= 0, joints_of[:, self.path], -1) if len(path) and alone else None
         self.size = 6 if (self.pairs[:, 1] >= 0).any() else 3
-        solves = self.size * colours if len(chain) else 0
+        solves = self.size * colours if len(path) else 0
         self.units = np.zeros((solves, 1, 2 * joints, 3))
         for m, colour in enumerate(self.colour) if solves else ():
             for d in range(self.size):
                 block = self.pairs[m, d // 3]
                 if block >= 0 and not host.fixed[block, d % 3]:
                     self.units[colour * self.size + d, 0, 2 * m + d // 3, d % 3] = 1.0
-        return chain
+        return path
 
 
 def _couplings(host, path_node: np.ndarray, rod: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

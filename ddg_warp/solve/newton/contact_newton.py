@@ -54,7 +54,7 @@ class NewtonContact:
         self.hessian = ContactHessian(self.terms, touch.shapes)
         self.limit, self.pending = StepLimit(model, touch, self.bodies), PendingMotion(model, linear)
         self.diagnosis, self.tally = ContactDiagnosis(model, touch), ContactStatistics(self.terms)
-        self.has_friction, self.rate = host.touching.has_friction, rate
+        self.has_friction, self.rate = host.contact_parameters.has_friction, rate
         updates = touch.law.friction_iterations - 1 if self.has_friction else 0
         self.solutions = [wp.zeros_like(iterates.q) for _ in range(updates)]
         self.bends, self._late = psd != "gauss_newton", 0 if psd == "none" else FIRST_EXACT_ITERATION

@@ -31,7 +31,7 @@ from ddg_warp.solve.newton.rod_newton import FROZEN, FROZEN_ONLY, NewtonOptions
 from ddg_warp.solve.newton.sleeping_islands import SleepingIslands
 from ddg_warp.timers import timer
 
-PRECONDITIONERS = ("block_jacobi", "chain", "multilevel", "chain_multilevel")
+PRECONDITIONERS = ("block_jacobi", "substructuring", "multilevel", "substructuring_multilevel")
 STRAIGHT = 1e-9  # rest turning angle between edges that may be rounding [rad]
 RESCALED = 2.0**12  # change of the natural scale that conjugate gradients tolerate
 
@@ -43,16 +43,18 @@ class CoupledNewton:
     solver components, which get the state that they read and write as arguments.
 
     Args:
-        preconditioner: of conjugate gradients: "block_jacobi", "chain" (substructuring, see `kernels.linear.rod_substructuring`),
-            "multilevel" (see `kernels.linear.multilevel`), or "chain_multilevel", both.
+        preconditioner: of conjugate gradients: "block_jacobi", "substructuring" (substructuring, see
+            `kernels.linear.rod_substructuring`), "multilevel" (see `kernels.linear.multilevel`), or "substructuring_multilevel",
+            both.
         linear: scalar type of the linear algebra; default: the model's.
         drag: True if blocks have more than a mass; see `kernels.forces.drag`.
         reuse: True if the matrix of a step's first iterate serves the whole step.
-        split: True if edges may be stiffer than the matrix carries, where possible; see `RodSubstructuring.splits`.
+        mixed_axial: True if edges may be stiffer than the matrix carries, where possible; see `RodSubstructuring.allows_mixed_axial`.
 
     Attributes:
-        `sparsity`, `chains`: `SparseSystem` and, with substructuring, `RodSubstructuring`.
-        `frozen`, `planes`, `turns`, `contact`, `sleeping`, `relaxed`: components that not all models and options need, or None.
+        `sparsity`, `substructuring`: `SparseSystem` and, with substructuring, `RodSubstructuring`.
+        `frozen`, `planes`, `edge_rotations`, `contact`, `sleeping`, `relaxed`: components that not all models and options need, or
+            None.
         krylov: conjugate gradients; None if substructuring is exact.
     """
 
@@ -69,7 +71,7 @@ class CoupledNewton:
         linear=None,
         drag: bool = False,
         reuse: bool = False,
-        split: bool = False,
+        mixed_axial: bool = False,
     ):
         if reuse and options.psd not in FROZEN:
             raise SceneError(FROZEN_ONLY.format(options.psd))
@@ -80,7 +82,7 @@ class CoupledNewton:
         self.coupled = coupled = model.coupled
         self.options, self.linear = options, linear or model.types.linear
         host, real, self._eps = coupled.host, coupled.real, model.types.eps
-        if host.touching and reuse:
+        if host.contact_parameters and reuse:
             raise SceneError(
                 "contact: solver 'projective' keeps the matrix of a step, which contact changes; use 'newton'"
             )
@@ -90,24 +92,24 @@ class CoupledNewton:
         if self.psd == "none":
             self._require_exact()
 
-        self.chains = RodSubstructuring.of(coupled, preconditioner, self.banded, split)
-        self.sparsity = SparseSystem(coupled, self.chains and self.chains.kept)
+        self.substructuring = RodSubstructuring.of(coupled, preconditioner, self.banded, mixed_axial)
+        self.sparsity = SparseSystem(coupled, self.substructuring and self.substructuring.kept)
         self.planes = SkewSupports(coupled, self.sparsity, real, self.linear) if host.frames else None
-        banded = self.chains is not None and self.chains.banded
-        self.elements = ElementEvaluation(coupled, self.psd, self.linear, banded, split)
+        banded = self.substructuring is not None and self.substructuring.banded
+        self.elements = ElementEvaluation(coupled, self.psd, self.linear, banded, mixed_axial)
         matrix = self.sparsity, self.elements.outputs, self.linear, self.elements.exact_from
         self._assembly = MatrixAssembly(coupled, *matrix, self.elements.local, drag)
-        if self.chains:
-            self.chains.bind(*matrix, drag, reuse)
+        if self.substructuring:
+            self.substructuring.bind(*matrix, drag, reuse)
         self.iterates, self.norms = Iterates.of(coupled), ResidualNorms.of(coupled)
         self.search_state, self.tolerances = SearchState.of(coupled), ResidualTolerances(coupled, real, self.linear)
         self.loading = Loading.of(coupled, model.scene.gravity, drag, self.tolerances)
         self.contact = None
-        if host.touching:
+        if host.contact_parameters:
             self.contact = NewtonContact(model, self.iterates, self.islands.inverse_step, self.linear, self.psd)
-            if self.chains:
-                self.contact.hessian.bind(self.chains)
-        self.exact = self.chains is not None and self.chains.exact
+            if self.substructuring:
+                self.contact.hessian.bind(self.substructuring)
+        self.exact = self.substructuring is not None and self.substructuring.exact
         fails = self.psd == "none"
         curved = any(first is not None for first in self.elements.exact_from) or bool(
             self.contact and self.contact.bends
@@ -118,7 +120,7 @@ class CoupledNewton:
         self.system = LinearSystem.of(
             coupled,
             self.sparsity,
-            self.chains,
+            self.substructuring,
             self.linear,
             self.islands.needs_direction,
             self.updated_islands.needs_direction,
@@ -128,7 +130,7 @@ class CoupledNewton:
             coupled,
             self.elements,
             self.sparsity,
-            self.chains,
+            self.substructuring,
             self.planes,
             self.tolerances,
             self.contact and self.contact.terms,
@@ -140,17 +142,17 @@ class CoupledNewton:
         most = int(options.unconverged_fraction * self.contact.touching_bodies) if self.contact else 0
         self.line_search = LineSearch(coupled, self.linear, most > 0)
         self._worst = Sums(coupled.worlds, self.tolerances.ratio.shape[1], real, coupled.device, largest=True)
-        lengthened = self.chains if any(self.elements.split) else None
-        self.turns = EdgeRotations(coupled, self.linear, lengthened) if host.rods else None
+        lengthened = self.substructuring if any(self.elements.mixed_axial) else None
+        self.edge_rotations = EdgeRotations(coupled, self.linear, lengthened) if host.rods else None
         self.sleeping = self.relaxed = self.krylov = None
         if self.contact:
             tolerances, bodies = self.tolerances, self.contact.bodies
-            self.sleeping = SleepingIslands(coupled, self.linear, tolerances, self.chains, *bodies)
+            self.sleeping = SleepingIslands(coupled, self.linear, tolerances, self.substructuring, *bodies)
         if most:
             self.relaxed = RelaxedConvergence(coupled, self.sleeping, most)
         if not self.exact:
-            parts = self.sparsity, self.chains, self.contact and self.contact.hessian
-            multilevel = preconditioner in ("multilevel", "chain_multilevel")
+            parts = self.sparsity, self.substructuring, self.contact and self.contact.hessian
+            multilevel = preconditioner in ("multilevel", "substructuring_multilevel")
             stop = self.tolerances, options.rtol, self.relaxed, self.keeps_levels and not self.contact
             self.krylov = NewtonPCG(coupled, *parts, self.linear, multilevel, *stop)
 
@@ -168,13 +170,15 @@ class CoupledNewton:
 
         Bodies in contact rotate and bend: without second derivatives the last digits take tens of iterations.
         """
-        if self.coupled.host.touching:
+        if self.coupled.host.contact_parameters:
             return "progressive"
         bending = [part for part in self.coupled.sets if part.term.measure.packed and not self.frozen]
         if any(part.parameters.foreign.intersection(part.term.rest) for part in bending):
             return "progressive"
-        turns = (part.parameters[name] * part.parameters["measure"] for part in bending for name in part.term.rest)
-        return "progressive" if any(np.abs(turn).max() > STRAIGHT for turn in turns) else "gauss_newton"
+        edge_rotations = (
+            part.parameters[name] * part.parameters["measure"] for part in bending for name in part.term.rest
+        )
+        return "progressive" if any(np.abs(turn).max() > STRAIGHT for turn in edge_rotations) else "gauss_newton"
 
     @property
     def outdated(self) -> bool:
@@ -195,7 +199,15 @@ class CoupledNewton:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         parts = (self._residual, self.tolerances, self.line_search, self._worst, self.elements, self._assembly)
-        parts += (self.frozen, self.chains, self.krylov, self.planes, self.turns, self.contact, self.sleeping)
+        parts += (
+            self.frozen,
+            self.substructuring,
+            self.krylov,
+            self.planes,
+            self.edge_rotations,
+            self.contact,
+            self.sleeping,
+        )
         kernels = [kernel for part in (*parts, self.relaxed) if part for kernel in part.kernels]
         return [*kernels, *self.coupled.carries, *([self._repeat] if self._repeat else [])]
 
@@ -222,14 +234,14 @@ class CoupledNewton:
         self.islands.signals.zero_()
         self.evaluate(state)
         self.balance()
-        self.judge()
+        self.decide_action()
         wp.capture_if(self.islands.any_active, lambda: self._step(state))
 
     def _step(self, state) -> None:
         """Advance active worlds to the next iterate."""
         wp.capture_if(self.islands.any_needs_direction, self._find_direction)
         self.line_search.move(self.iterates, self.system, self.islands)
-        if self.turns:
+        if self.edge_rotations:
             wp.capture_if(self.islands.any_edge_rotation, lambda: self._rotate(state))
         if self.contact:
             self.contact.hold(self.iterates, self.search_state, self.system, self.islands)
@@ -260,7 +272,7 @@ class CoupledNewton:
         self.tolerances.sum_up(system.rhs, self.options.rtol, islands, *flags, self.exact and not self.frozen)
 
     @timer("line search")
-    def judge(self) -> None:
+    def decide_action(self) -> None:
         """Stop worlds, reject their iterates, or request a direction."""
         norms, islands, ratio, rtol = self.norms, self.islands, self.tolerances.ratio, self.options.rtol
         sums = [partial(self.line_search.sum_norms, norms), partial(self._worst, ratio, norms.worst)]
@@ -271,7 +283,7 @@ class CoupledNewton:
             self.relaxed.excuse(rtol, norms, islands)
         if self.contact:
             self.contact.account(norms, islands)
-        self.line_search.judge(norms, self.search_state, self.system, islands, self.options, self._eps)
+        self.line_search.decide_action(norms, self.search_state, self.system, islands, self.options, self._eps)
 
     @timer("assemble")
     def assemble(self) -> None:
@@ -290,8 +302,8 @@ class CoupledNewton:
         self._assembly(mass, updated_islands, matrix)
         if self.planes:
             self.planes.matrix(matrix, updated_islands.needs_direction)
-        if self.chains and not self.exact:
-            self.chains.bands.assemble(matrix, mass, updated_islands)
+        if self.substructuring and not self.exact:
+            self.substructuring.bands.assemble(matrix, mass, updated_islands)
 
     @timer("direction")
     def direct(self) -> None:
@@ -300,7 +312,7 @@ class CoupledNewton:
         if self.exact:
             system.indefinite.zero_()
             system.forcing.zero_()  # only rounding is left
-            self.chains.direct(system, self.loading.mass, islands, self.updated_islands)
+            self.substructuring.direct(system, self.loading.mass, islands, self.updated_islands)
         else:
             if self.contact:
                 self.contact.pending.approach(self.iterates, system, self.contact.terms)
@@ -330,6 +342,6 @@ class CoupledNewton:
     @timer("edge rotation")
     def _rotate(self, state) -> None:
         """Position the nodes of rods with edge rotations, and update the frames of `state` where required."""
-        self.turns.place(self.iterates, self.system, self.islands)
+        self.edge_rotations.place(self.iterates, self.system, self.islands)
         if self.coupled.edges:
             self.coupled.renew(state, self.iterates.q, self.islands.iterate_action)

@@ -34,9 +34,9 @@ class Iterates:
         q, base, target = (
             wp.zeros(coupled.worlds * coupled.blocks, dtype=coupled.vector, device=coupled.device) for _ in range(3)
         )
-        if coupled.host.touching:
+        if coupled.host.contact_parameters:
             q.assign(np.tile(coupled.host.rest, (coupled.worlds, 1)))
-        return cls(q, base, target, wp.zeros_like(q) if coupled.host.touching else q)
+        return cls(q, base, target, wp.zeros_like(q) if coupled.host.contact_parameters else q)
 
 
 @dataclass
@@ -93,7 +93,7 @@ class ResidualNorms:
         return self.of_blocks[0]
 
     @property
-    def noise(self) -> wp.array:
+    def rounding_error(self) -> wp.array:
         """Rounding bound of the change of the energy of blocks."""
         return self.of_blocks[1]
 

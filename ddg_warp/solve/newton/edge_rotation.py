@@ -17,10 +17,10 @@ class EdgeRotations:
 
     Args:
         linear: scalar type of directions.
-        `chains`: `RodSubstructuring` with edge tensions as unknowns, which lengthen edges; None without.
+        `substructuring`: `RodSubstructuring` with edge tensions as unknowns, which lengthen edges; None without.
     """
 
-    def __init__(self, coupled, linear, chains=None):
+    def __init__(self, coupled, linear, substructuring=None):
         self.coupled, host, device, real = coupled, coupled.host, coupled.device, coupled.real
         plan = host.rod_order
 
@@ -40,7 +40,11 @@ class EdgeRotations:
         between = wp.array(between, dtype=real, device=device)
         self._places = [self._nodes, put(pieces.of), self._starts, put(anchors), between]
         # path node with the tension of every edge, and the lengthening by tensions
-        self._behind = [put(chains.plan.places_ahead(rod)), chains.bands.longer, chains.paths.width] if chains else []
+        self._behind = (
+            [put(substructuring.plan.places_ahead(rod)), substructuring.bands.longer, substructuring.paths.width]
+            if substructuring
+            else []
+        )
         self._ends = put(np.concatenate([rod.ends for rod in host.rods]))
         vector, worlds = wp.types.vector(3, real), coupled.worlds
         self._sums = wp.zeros((worlds, len(plan.nodes)), dtype=vector, device=device)

@@ -8,7 +8,7 @@ import warp as wp
 from ddg_warp import device_arrays
 from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.coupled_element import coupled_storage
-from ddg_warp.kernels.linear.rod_dof_map import splits
+from ddg_warp.kernels.linear.rod_dof_map import allows_mixed_axial
 from ddg_warp.solve.newton.rod_newton import FIRST_EXACT_ITERATION
 
 
@@ -18,7 +18,7 @@ class ElementEvaluation:
     Args:
         psd: see `NewtonOptions`; linear: scalar type of factors.
         banded: True if substructuring assembles elements along rods.
-        split: True if edges may be stiffer than the matrix carries, where possible; see `RodSubstructuring.splits`.
+        mixed_axial: True if edges may be stiffer than the matrix carries, where possible; see `RodSubstructuring.allows_mixed_axial`.
 
     Attributes:
         exact_from: first iteration with second derivatives, or None.
@@ -26,17 +26,18 @@ class ElementEvaluation:
         outputs: output arrays by name.
     """
 
-    def __init__(self, coupled, psd: str, linear, banded: bool, split: bool):
+    def __init__(self, coupled, psd: str, linear, banded: bool, mixed_axial: bool):
         self.coupled, self._linear = coupled, linear
         serial = device_arrays.serial(coupled.device)
         exact = [psd != "gauss_newton" and part.term.measure.packed > 0 for part in coupled.sets]
         first = 0 if psd == "none" else FIRST_EXACT_ITERATION
         self.exact_from = tuple(first if wanted else None for wanted in exact)
         self.local = tuple(banded and part.host.along for part in coupled.sets)
-        self.split = tuple(
-            split and local and splits(part.term) for local, part in zip(self.local, coupled.sets, strict=True)
+        self.mixed_axial = tuple(
+            mixed_axial and local and allows_mixed_axial(part.term)
+            for local, part in zip(self.local, coupled.sets, strict=True)
         )
-        options = list(zip(coupled.sets, self.exact_from, self.local, self.split, strict=True))
+        options = list(zip(coupled.sets, self.exact_from, self.local, self.mixed_axial, strict=True))
         self.outputs = [self._allocate(*of_set) for of_set in options]
         self._kernels = [
             element_path.evaluate_kernel(
@@ -49,7 +50,7 @@ class ElementEvaluation:
             for part, first, local, is_split in options
         ]
 
-    def _allocate(self, part, exact_from: int | None, local: bool, split: bool) -> dict[str, wp.array]:
+    def _allocate(self, part, exact_from: int | None, local: bool, mixed_axial: bool) -> dict[str, wp.array]:
         """Return the output arrays of an element set."""
         coupled, linear, measure = self.coupled, self._linear, part.term.measure
         count, vector = coupled.worlds * part.elements, wp.types.vector(3, linear)
@@ -65,7 +66,7 @@ class ElementEvaluation:
 
         return {
             "factor": lay(len(measure.strains) * rows, factor),
-            "tension": lay(max(1, measure.tensions) + split, linear),
+            "tension": lay(max(1, measure.tensions) + mixed_axial, linear),
             "second": make((1, 1)) if exact_from is None else lay(measure.packed, linear),
             "gradient": lay(rows, gradient),
             "energy": lay(2, coupled.real),

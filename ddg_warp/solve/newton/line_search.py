@@ -36,13 +36,13 @@ class LineSearch:
         self._sum = Sums(worlds, takers[0], real, device)
         self._sum_norms = Sums(3 * worlds, blocks, real, device)
         self._largest = Sums(worlds, takers[1], real, device, largest=True)
-        self._judge, self._measure, self._rotate, self._take, self._move = search_kernels(
+        self._decide_action, self._measure, self._rotate, self._take, self._move = search_kernels(
             real,
             linear,
             device_arrays.serial(device),
             bool(host.rods),
             bool(coupled.edges),
-            host.touching is not None,
+            host.contact_parameters is not None,
             relaxed,
         )
 
@@ -50,18 +50,18 @@ class LineSearch:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         sums = (kernel for part in (self._sum, self._sum_norms, self._largest) for kernel in part.kernels)
-        return [self._judge, self._measure, self._rotate, self._take, self._move, *sums]
+        return [self._decide_action, self._measure, self._rotate, self._take, self._move, *sums]
 
     def sum_norms(self, norms) -> None:
         """Sum the norms of blocks over each world."""
         self._sum_norms(norms.of_blocks.reshape((3 * self.coupled.worlds, -1)), norms.of_worlds.flatten())
 
-    def judge(self, norms, search, system, islands, options, eps: float) -> None:
+    def decide_action(self, norms, search, system, islands, options, eps: float) -> None:
         """Stop worlds, reject their iterates, or request a direction to some forcing term."""
         inputs = [*(norms.of_worlds[i] for i in range(3)), norms.worst, options.rtol, options.floor_factor * eps]
         inputs += [options.max_iterations, options.max_halvings, LOOSEST, options.linear_rtol, SPARE]
         outputs = [*islands.arrays, search.best, search.stalled, system.forcing, system.goal, system.limit]
-        wp.launch(self._judge, self.coupled.worlds, inputs, outputs, device=self.coupled.device)
+        wp.launch(self._decide_action, self.coupled.worlds, inputs, outputs, device=self.coupled.device)
 
     def predict_decrease(self, search, system) -> None:
         """Compute the decrease of the energy that directions predict."""

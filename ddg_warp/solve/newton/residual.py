@@ -14,21 +14,37 @@ class ResidualAssembler:
 
     Args:
         elements: `ElementEvaluation`, whose outputs are assembled; sparsity: `SparseSystem`, with the incidence lists.
-        `chains`, `planes`, `contact`: `RodSubstructuring`, `SkewSupports` and `ContactPotential`, or None.
+        `substructuring`, `planes`, `contact`: `RodSubstructuring`, `SkewSupports` and `ContactPotential`, or None.
         tolerances: `ResidualTolerances`, whose ratios of blocks and rounding floors are written.
         rtol: relative tolerance; floor: rounding floor over the rounding bound.
         drag: True if blocks have more than a mass.
     """
 
     def __init__(
-        self, coupled, elements, sparsity, chains, planes, tolerances, contact, linear, rtol: float, floor: float, drag
+        self,
+        coupled,
+        elements,
+        sparsity,
+        substructuring,
+        planes,
+        tolerances,
+        contact,
+        linear,
+        rtol: float,
+        rounding_factor: float,
+        drag,
     ):
         self.coupled, host, real, lengths = coupled, coupled.host, coupled.real, coupled.host.edge_lengths
-        self.bands = chains.bands if chains and chains.banded else None
+        self.bands = substructuring.bands if substructuring and substructuring.banded else None
         self._inputs = inputs = coupled_residual.inputs_type(real, drag)()
         self._outputs = outputs = coupled_residual.results_type(real, linear)()
         inputs.arm, inputs.longest, inputs.settled = lengths.mean(), lengths.max(), SETTLED * host.bodies.shortest
-        inputs.blocks, inputs.nodes, inputs.rtol, inputs.floor = coupled.blocks, host.nodes, rtol, floor
+        inputs.blocks, inputs.nodes, inputs.rtol, inputs.rounding_factor = (
+            coupled.blocks,
+            host.nodes,
+            rtol,
+            rounding_factor,
+        )
         inputs.allowed, outputs.least, outputs.ratio = tolerances.blocks, tolerances.least, tolerances.ratio
         if contact:
             inputs.push, inputs.pressed = contact.forces, contact.blocks.stiffness
@@ -53,7 +69,7 @@ class ResidualAssembler:
         inputs.q, inputs.base, inputs.target = iterates.proposed, iterates.base, iterates.target
         inputs.mass, inputs.gravity, inputs.load = loading.mass, loading.gravity, loading.force
         inputs.fixed, outputs.rhs = system.masks.fixed, system.rhs
-        outputs.change, outputs.noise, outputs.square = norms.change, norms.noise, norms.square
+        outputs.change, outputs.rounding_error, outputs.square = norms.change, norms.rounding_error, norms.square
         if self.bands:
             self.bands.balance(inputs, islands, outputs)
         device_arrays.sweep(

@@ -80,7 +80,7 @@ class RodNewton:
         model, group, options: the problem, and the options of its solve.
         linear: scalar type of the linear algebra; default: the model's.
         midpoint: True if predicted iterates are midpoints, to which the lagged frames are carried.
-        split: True if edges may be stiffer than the matrix carries, with tensions as unknowns; see
+        mixed_axial: True if edges may be stiffer than the matrix carries, with tensions as unknowns; see
             `kernels.linear.mixed_axial_force`.
 
     Attributes:
@@ -94,7 +94,9 @@ class RodNewton:
 
     reuse = False  # True if the matrix of a step's first iterate serves the whole step
 
-    def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False, split: bool = False):
+    def __init__(
+        self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False, mixed_axial: bool = False
+    ):
         self.group, self.options = group, options
         self.real, self.linear = model.types.real, linear or model.types.linear
         self.eps = model.types.eps
@@ -114,11 +116,13 @@ class RodNewton:
         if kind.drag:
             self.mass = make(*nodes, dtype=rod_layout.inertia_type(kind, self.real))
             self.rotary = make(*twisted)
-        self.factor = make(kind.factor_rows + split, *nodes, dtype=self.linear)
+        self.factor = make(kind.factor_rows + mixed_axial, *nodes, dtype=self.linear)
         self.gradient = make(kind.window, *nodes)
         self.energy = make(2, *nodes)
         self.stiffness = make(*nodes, dtype=self.linear)
-        self.rhs, self.direction = (make(rows, *nodes, dtype=self.linear) for rows in (kind.block, kind.block + split))
+        self.rhs, self.direction = (
+            make(rows, *nodes, dtype=self.linear) for rows in (kind.block, kind.block + mixed_axial)
+        )
         self.energy_change, self.energy_noise = make(*nodes), make(*nodes, dtype=self.linear)
         self.islands = Islands(columns, self.real, device)
         self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
@@ -135,7 +139,7 @@ class RodNewton:
             self.real,
             self.linear,
             self.exact,
-            split,
+            mixed_axial,
             self.definite,
             self.reuse,
         )
@@ -152,16 +156,16 @@ class RodNewton:
         self._check = rod_residual.check_kernel(kind, self.real, self.linear)
         self._predict = rod_step.predict_kernel(kind, self.real, self.linear, midpoint)
         self._further = None if midpoint else warm_start.further_kernel(kind, self.real, self.linear)
-        self._prepare_sweep(split)
+        self._prepare_sweep(mixed_axial)
 
-    def _prepare_sweep(self, split: bool) -> None:
+    def _prepare_sweep(self, mixed_axial: bool) -> None:
         """Allocate the data of eliminated nodes, and build the kernels of an iteration."""
         group, kind = self.group, self.group.kind
-        kept = 2 * kind.block**2 + kind.block + (mixed_axial_force.kept_rows(kind.block) if split else 0)
+        kept = 2 * kind.block**2 + kind.block + (mixed_axial_force.kept_rows(kind.block) if mixed_axial else 0)
         self.elimination = device_arrays.allocate((kept, group.nodes, group.columns), self.linear, self.device)
         self._threads = 32 if group.columns < MANY else 128
-        self._sweep = sweep.sweep_kernel(kind, self.real, self.linear, self.exact_from, self.psd == "none", split)
-        self._adjust = rod_iterate.adjust_kernel(kind, self.real, self.linear, split)
+        self._sweep = sweep.sweep_kernel(kind, self.real, self.linear, self.exact_from, self.psd == "none", mixed_axial)
+        self._adjust = rod_iterate.adjust_kernel(kind, self.real, self.linear, mixed_axial)
 
     def automatic_psd(self) -> str:
         """Return the mode of `NewtonOptions.psd` that suits the rods: Gauss-Newton lacks the effect of natural curvature on roll."""

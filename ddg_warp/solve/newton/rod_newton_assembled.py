@@ -29,26 +29,26 @@ class AssembledNewton(RodNewton):
         options: NewtonOptions,
         linear=None,
         midpoint: bool = False,
-        split: bool = False,
+        mixed_axial: bool = False,
         stored=None,
         ranges: int = 1,
     ):
-        super().__init__(model, group, options, linear, midpoint, split)
+        super().__init__(model, group, options, linear, midpoint, mixed_axial)
         kind, self.stored, self.ranges = group.kind, stored or self.linear, ranges
         self.blocks = self.vectors(3 * kind.block**2)
         self.islands.edges_rotated.fill_(1)  # `base` is the start of every step
         self.partial = device_arrays.allocate((4, ranges, group.columns), self.real, self.device)
         self._assemble = rod_matrix.assemble_kernel(kind, self.real, self.linear, self.exact_from, self.stored)
         self._weigh, self._gauge = line_search.sum_kernels(kind, self.real, self.linear)
-        self._judge, self._take = line_search.decide_kernels(kind, self.real, self.exact, self.psd == "none")
+        self._decide_action, self._take = line_search.decide_kernels(kind, self.real, self.exact, self.psd == "none")
 
-    def _prepare_sweep(self, split: bool) -> None:
+    def _prepare_sweep(self, mixed_axial: bool) -> None:
         """Do nothing: the matrix is assembled, not swept."""
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture, except the kernels of `direct` and `move`."""
-        return [*self.kernels_around, self._assemble, self._weigh, self._gauge, self._judge, self._take]
+        return [*self.kernels_around, self._assemble, self._weigh, self._gauge, self._decide_action, self._take]
 
     def vectors(self, rows: int | None = None) -> wp.array:
         """Return zeros of the linear algebra for every node, by default as many as its dofs."""
@@ -58,7 +58,7 @@ class AssembledNewton(RodNewton):
     def sweep(self) -> None:
         """Assemble, decide, solve for a direction and take it."""
         self.assemble_blocks()
-        self.judge()
+        self.decide_action()
         self.direct()
         self.take()
         self.move()
@@ -77,7 +77,7 @@ class AssembledNewton(RodNewton):
         )
 
     @timer("line search")
-    def judge(self) -> None:
+    def decide_action(self) -> None:
         """Stop rods, reject their iterates, or request a direction."""
         options = self.options
         self._launch(
@@ -87,7 +87,7 @@ class AssembledNewton(RodNewton):
             [self.partial],
         )
         wp.launch(
-            self._judge,
+            self._decide_action,
             self.group.columns,
             [self.partial, self.ranges, options.floor_factor * self.eps, options.max_iterations, options.max_halvings]
             + self.islands.arrays,

@@ -20,9 +20,11 @@ class RodNewtonParallel(AssembledNewton):
     An iteration is about 2 log2(n) + 10 launches. Loops of one thread run over sqrt(n) nodes or ranges of nodes.
     """
 
-    def __init__(self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False, split: bool = False):
+    def __init__(
+        self, model, group, options: NewtonOptions, linear=None, midpoint: bool = False, mixed_axial: bool = False
+    ):
         self.width = math.isqrt(group.nodes - 1) + 1
-        super().__init__(model, group, options, linear, midpoint, split, ranges=-(-group.nodes // self.width))
+        super().__init__(model, group, options, linear, midpoint, mixed_axial, ranges=-(-group.nodes // self.width))
         kind, device, real = group.kind, model.wp_device, self.real
         vector, columns = wp.types.vector(kind.dim, real), group.columns
         self.midpoint = midpoint
@@ -31,12 +33,12 @@ class RodNewtonParallel(AssembledNewton):
         self.mean = wp.zeros(columns, dtype=vector, device=device)
         self.held = device_arrays.upload(_fixed_neighbours(group), int, device)
         self.new_frame = device_arrays.allocate(self.frame.shape, real, device)
-        if split:
+        if mixed_axial:
             self.reduction = TensionReduction(group, real, self.linear, device)
         else:
             self.reduction = CyclicReduction(kind.block, group.nodes, columns, self.linear, device)
-        self.split = split
-        self._moves = rod_iterate_parallel.move_kernels(kind, real, self.linear, split)
+        self.mixed_axial = mixed_axial
+        self._moves = rod_iterate_parallel.move_kernels(kind, real, self.linear, mixed_axial)
         self._turn_ahead, *_ = rod_iterate_parallel.move_kernels(kind, real, self.linear)
         self._aim, self._renew, self._again = rod_iterate_parallel.predict_kernels(kind, real, self.linear)
 
@@ -45,7 +47,7 @@ class RodNewtonParallel(AssembledNewton):
         """Kernels to load before a capture."""
         result = [*self._moves, self._aim]
         result += [self._renew] if self.midpoint else [self._again]
-        result += [self._turn_ahead] * self.split  # without `split`, it is among the moves
+        result += [self._turn_ahead] * self.mixed_axial  # without `mixed_axial`, it is among the moves
         replaced = self._predict, self._further  # replaced by kernels of this class
         return [*(kernel for kernel in super().kernels if kernel not in replaced), *result, *self.reduction.kernels]
 
@@ -72,7 +74,7 @@ class RodNewtonParallel(AssembledNewton):
     def direct(self) -> None:
         """Compute directions by cyclic reduction."""
         islands = self.islands
-        if self.split:
+        if self.mixed_axial:
             self.reduction.solve(self.blocks, self.factor, self.rhs, self.x, islands, self.direction)
         else:
             self.reduction.solve(

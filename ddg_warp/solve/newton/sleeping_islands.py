@@ -26,14 +26,14 @@ class SleepingIslands:
 
     Args:
         linear: scalar type of products with pairs.
-        tolerances: `ResidualTolerances`; `chains`: `RodSubstructuring`, or None.
+        tolerances: `ResidualTolerances`; `substructuring`: `RodSubstructuring`, or None.
         body: body (rod, shell, or several joined) of each block (blocks,), -1 for none; bodies: largest possible number of bodies.
 
     Attributes:
         owner: body of every ratio of the tolerances, -1 for none.
     """
 
-    def __init__(self, coupled, linear, tolerances, chains, body: np.ndarray, bodies: int):
+    def __init__(self, coupled, linear, tolerances, substructuring, body: np.ndarray, bodies: int):
         self._device, self._worlds, self.bodies = coupled.device, coupled.worlds, bodies
         owner = [body]
         for level in tolerances.bodies.levels:  # sums over clusters belong to the body of their blocks
@@ -45,7 +45,9 @@ class SleepingIslands:
         self.owner, self._body = put(np.concatenate(owner)), put(body)
         self._link, self._awake = (put(np.arange(coupled.worlds * bodies)) for _ in range(2))
         self._any = put(np.zeros(coupled.worlds))
-        self._where, self._width = (chains.paths.where, chains.paths.width) if chains else (put([]), 1)
+        self._where, self._width = (
+            (substructuring.paths.where, substructuring.paths.width) if substructuring else (put([]), 1)
+        )
         made = resting_kernels(coupled.real, linear, device_arrays.serial(coupled.device))
         self._begin, self._look, self._join, self._wake, self._settle, self._leave = self.kernels = made
 

@@ -22,15 +22,19 @@ class StepLimit:
 
     Attributes:
         modes: (worlds,) whether a world moves, and by how many fractions; see `kernels.newton.contact_newton`.
-        keep: fraction of the gap that every pair keeps; see `ContactModel`.
+        min_separation_fraction: fraction of the gap that every pair keeps; see `ContactModel`.
         farthest: [m] largest motion of nodes in worlds with a single step fraction, while candidates do not fit.
     """
 
     def __init__(self, model, touch, bodies: tuple[np.ndarray, int]):
-        self.coupled, self.search, self.keep = model.coupled, touch.search, touch.keep
+        self.coupled, self.search, self.min_separation_fraction = (
+            model.coupled,
+            touch.search,
+            touch.min_separation_fraction,
+        )
         real, device = self.coupled.real, self.coupled.device
-        unit, self._units = number_units(*bodies, self.coupled.host, model.motions)
-        self._unit = wp.array(unit, dtype=int, device=device)
+        ccd_body, self._num_ccd_bodies = number_units(*bodies, self.coupled.host, model.motions)
+        self._ccd_body = wp.array(ccd_body, dtype=int, device=device)
         self._start = wp.zeros(self.coupled.worlds * self.coupled.blocks, dtype=self.coupled.vector, device=device)
         self.modes = wp.zeros(self.coupled.worlds, dtype=int, device=device)
         self._longest, self.farthest = wp.zeros(self.coupled.worlds, dtype=real, device=device), math.inf
@@ -45,12 +49,14 @@ class StepLimit:
     def __call__(self, iterates) -> None:
         """Limit the proposed motion from `base` to `q`; `proposed` keeps the proposed end."""
         q, blocks, far = iterates.q, self.coupled.blocks, FAR * self.search.margin
-        inputs = [q, iterates.base, self._unit, self.coupled.host.nodes, far, blocks]
+        inputs = [q, iterates.base, self._ccd_body, self.coupled.host.nodes, far, blocks]
         self.coupled.sweep(self._stay, inputs, [self._start, self.modes, iterates.proposed, self._longest])
         shorter = [self.modes, self._longest, self.farthest]
         if self.farthest < math.inf:
-            self.coupled.sweep(self._near, [self._start, self._unit, *shorter, blocks], [q])
-        self.search.filter(self._start, q, self._unit, self.modes, self._units, self.keep)
+            self.coupled.sweep(self._near, [self._start, self._ccd_body, *shorter, blocks], [q])
+        self.search.filter(
+            self._start, q, self._ccd_body, self.modes, self._num_ccd_bodies, self.min_separation_fraction
+        )
         if self.farthest < math.inf:
             self._launch(self._less, shorter, [self.search.time])
 
@@ -71,7 +77,7 @@ class StepLimit:
         while True:
             fraction = min(1.0, self.farthest / longest) if longest > 0.0 else 1.0
             q = blocks(before + fraction * move)
-            self.search.filter(base, q, self._unit, self.modes, self._units, self.keep)
+            self.search.filter(base, q, self._ccd_body, self.modes, self._num_ccd_bodies, self.min_separation_fraction)
             if not self.search.fit(base, lambda: self._shorten(longest)):  # else the filter moved nothing
                 return fraction * float(self.search.time.numpy().min())
 

@@ -67,7 +67,9 @@ class CoupledStep(StepDriver):
         reuse = integrator.solver == "projective"
         if options.psd == "auto" and means.stiff and not reuse:
             options = replace(options, psd="progressive")
-        solver = CoupledNewton(model, options, preconditioner, means.linear, host.drag is not None, reuse, means.split)
+        solver = CoupledNewton(
+            model, options, preconditioner, means.linear, host.drag is not None, reuse, means.mixed_axial
+        )
         super().__init__(integrator, model, solver, means, counts_of)
         self.contact = solver.contact
         if counts_of is not None:
@@ -101,7 +103,7 @@ class CoupledStep(StepDriver):
         self.arcs = self._resolve_arcs()
         self.field = CoupledField(model, self.midpoint, integrator.field)
         self._data = (self.motion.data if self.motion else {}) | self.field.data
-        self.alone, self._groups = None, counts_of and counts_of._groups
+        self.decoupled, self._groups = None, counts_of and counts_of._groups
         # steps since the last outside state; broad-phase and culling queries until the last rebuild of their BVHs
         self._since_renewal, self._sought = 0, (0, 0)
 
@@ -141,19 +143,19 @@ class CoupledStep(StepDriver):
         """Rebuild all BVHs from a state for `TREES`, or the culling BVHs alone for `RUNS`; launches only."""
         if level == TREES:
             self.newton.contact.renew(before.q)
-        if self.alone:
-            self.alone.renew()
+        if self.decoupled:
+            self.decoupled.renew()
 
     def step(self, before, after) -> None:
         """Launch a whole step from one state to another."""
-        if self.alone is None or self.coupled.worlds > 1:
+        if self.decoupled is None or self.coupled.worlds > 1:
             self._keep()
         if len(before.rate):
             wp.copy(after.rate, before.rate)
-        if self.alone is None:
+        if self.decoupled is None:
             super().step(before, after)
             return
-        self.alone.step(before, after)
+        self.decoupled.step(before, after)
 
     def _keep(self) -> None:
         """Save the counts before a step that may be repeated."""
@@ -168,7 +170,7 @@ class CoupledStep(StepDriver):
         if self.coupled.worlds == 1:  # nothing is counted yet
             self._keep()
         else:
-            self.integrator._worlds.take_part(self.alone.left, before, after, self.coupled.worlds)
+            self.integrator._worlds.take_part(self.decoupled.left, before, after, self.coupled.worlds)
             wp.copy(self.newton.iterates.q, after.q)
             before = after
         self._try(before, after)
@@ -177,8 +179,8 @@ class CoupledStep(StepDriver):
     def prescribe(self, t0: float, t1: float) -> None:
         """Upload supports, loads, magnetic field and flow between t0 and t1."""
         super().prescribe(t0, t1)
-        for chain in self._rods:
-            chain.prescribe(t0, t1)
+        for rod_step in self._rods:
+            rod_step.prescribe(t0, t1)
         if self.arcs:
             self._cut(self.arcs.levels(t0, t1), t0, t1)
 
@@ -187,9 +189,9 @@ class CoupledStep(StepDriver):
         if not (levels.any() or self.motion.levels.any()):
             return
         if self.motion.divide(levels, t0, t1):
-            for chain in self._rods:
-                if chain.motion:
-                    chain.motion.go_by(self.motion)
+            for rod_step in self._rods:
+                if rod_step.motion:
+                    rod_step.motion.go_by(self.motion)
             self.integrator._graphs.clear()
         self.islands.interval.assign(0.5**levels)
         self.islands.substep.assign(0.5**levels)
@@ -197,31 +199,33 @@ class CoupledStep(StepDriver):
     def load_modules(self) -> None:
         """Compile and load every kernel before a capture."""
         super().load_modules()
-        if self.alone is None:
+        if self.decoupled is None:
             return
-        device_arrays.load_kernels(self.alone.kernels, self.model.wp_device)
-        for chain in self._rods:
-            chain.load_modules()
+        device_arrays.load_kernels(self.decoupled.kernels, self.model.wp_device)
+        for rod_step in self._rods:
+            rod_step.load_modules()
         if self.coupled.worlds > 1:
             self.integrator._worlds.load_modules()
 
     @property
     def _rods(self) -> list:
         """Uncoupled steps of the rods; empty without `alone`."""
-        return self.alone.chains if self.alone else []
+        return self.decoupled.rod_steps if self.decoupled else []
 
     def adapt(self, s: float, parameters_changed: bool = False) -> bool:
         """Select uncoupled stepping of rods out of contact, and solvers for s [s]; return True if the selection changed.
 
         `parameters_changed`: see `StepDriver.choose_solver`.
         """
-        before = self.alone
+        before = self.decoupled
         if not (uncoupled(self.model) and is_decoupled(self.integrator)):
-            self.alone = None
-        elif self.alone is None:
+            self.decoupled = None
+        elif self.decoupled is None:
             self._groups = self._groups or rods_of(self.model)
-            self.alone = DecoupledStep(self, self._groups)
-        return self.alone is not before or (self.alone is not None and self.alone.adapt(s, parameters_changed))
+            self.decoupled = DecoupledStep(self, self._groups)
+        return self.decoupled is not before or (
+            self.decoupled is not None and self.decoupled.adapt(s, parameters_changed)
+        )
 
     @timer("capacity check")
     def has_overflow(self, before) -> bool:
@@ -256,8 +260,8 @@ class CoupledStep(StepDriver):
         )
         if self.motion:
             self.motion.place(islands, iterates.q)
-        if solver.turns:
-            solver.turns.predict(before.v, not self.midpoint, iterates, system, islands)
+        if solver.edge_rotations:
+            solver.edge_rotations.predict(before.v, not self.midpoint, iterates, system, islands)
         start = self._start_frames(before)
         if self.motion:
             self.motion.direct(islands, iterates.q, start.frame)
@@ -348,21 +352,21 @@ class CoupledStep(StepDriver):
 
     def split_errors(self, s: float) -> np.ndarray:
         """Return float32 errors over s [s] in the mixed axial-force formulation; infinite if unavailable."""
-        chains = self.newton.chains
-        if not (chains and chains.splits) or self.newton.frozen:
+        substructuring = self.newton.substructuring
+        if not (substructuring and substructuring.allows_mixed_axial) or self.newton.frozen:
             return super().split_errors(s)
         return self.coupled.split_errors(s).max(initial=0.0, keepdims=True)
 
     def limit(self, s: float) -> None:
         """Set the limits of the islands for solves over s [s]."""
         super().limit(s)
-        for chain in self._rods:
-            chain.limit(s)
+        for rod_step in self._rods:
+            rod_step.limit(s)
 
     def _find_limits(self, s: float) -> dict[str, np.ndarray]:
         """Return the limits of islands by name, with the largest edge stiffness that float32 carries for the softest rod."""
         limits = super()._find_limits(s)
-        if any(self.newton.elements.split):
+        if any(self.newton.elements.mixed_axial):
             softest = self.coupled.rod_stiffnesses(s)[2].min()
             limits["max_edge_stiffness"] = np.full(len(self.islands), largest_carried(softest))
         return limits

@@ -28,7 +28,7 @@ class DecoupledStep:
     """Rods of a `CoupledStep` as uncoupled rod groups, whose states are scratch.
 
     Attributes:
-        `chains`: steps of the rod groups.
+        `rod_steps`: steps of the rod groups.
         runs: culling of rods; None if there are primitives other than edges.
         left: worlds of the last step that the coupled solver takes (worlds,).
     """
@@ -36,7 +36,7 @@ class DecoupledStep:
     def __init__(self, step, groups: list[RodGroup]):
         self.step_of, self.model, self.coupled = step, step.model, step.coupled
         real, device, worlds = self.model.types.real, self.model.wp_device, self.coupled.worlds
-        self.chains = [self._chain(group) for group in groups]
+        self.rod_steps = [self._rod_step(group) for group in groups]
         self._states = [self.model.group_state(group) for group in groups]
         self._places = [Places(self.coupled, group) for group in groups]
         self._kernels = [kernels.rod_kernels(group.kind, real) for group in groups]
@@ -46,18 +46,18 @@ class DecoupledStep:
         self._known = self.runs.known if self.runs else wp.full((KNOWN, worlds), 1, dtype=int, device=device)
         self._begin, self._hope, self._near, self._judge = kernels.world_kernels(real)
         self._wait, self._stay, self._follow = kernels.place_kernels(real, device_arrays.serial(device))
-        self._told = wp.zeros((kernels.REPORTED, worlds), dtype=int, device=device)
-        self.left, self._tried = (self._told[row] for row in (kernels.LEFT, kernels.TRIED))
+        self._world_status = wp.zeros((kernels.REPORTED, worlds), dtype=int, device=device)
+        self.left, self._tried = (self._world_status[row] for row in (kernels.LEFT, kernels.TRIED))
         self._any_tried, self._some, self._again = (wp.zeros(1, dtype=int, device=device) for _ in range(3))
         obstacles = np.concatenate([np.zeros(0, int), *self.coupled.host.obstacles]).astype(np.int32)
         self._obstacles = wp.array(obstacles, dtype=int, device=device)
         self._mixed = not all(places.whole for places in self._places)
 
-    def _chain(self, group: RodGroup, **options) -> RodStep:
-        chain = RodStep(self.step_of.integrator, self.model, group, **options)
-        if chain.motion:
-            chain.motion.go_by(self.step_of.motion)
-        return chain
+    def _rod_step(self, group: RodGroup, **options) -> RodStep:
+        rod_step = RodStep(self.step_of.integrator, self.model, group, **options)
+        if rod_step.motion:
+            rod_step.motion.go_by(self.step_of.motion)
+        return rod_step
 
     @property
     def kernels(self) -> list:
@@ -76,11 +76,11 @@ class DecoupledStep:
     def adapt(self, s: float, parameters_changed: bool = False) -> bool:
         """Update parameters and solver selection for a step of s [s], as `CoupledStep.adapt`; return True if graphs are outdated."""
         changed = any([places.take_parameters() for places in self._places])
-        for i, chain in enumerate(self.chains):
-            if (means := chain.choose_solver(s, parameters_changed)) != chain.means or (
-                parameters_changed and chain.newton.outdated
+        for i, rod_step in enumerate(self.rod_steps):
+            if (means := rod_step.choose_solver(s, parameters_changed)) != rod_step.means or (
+                parameters_changed and rod_step.newton.outdated
             ):
-                self.chains[i], changed = self._chain(chain.group, means=means, counts_of=chain), True
+                self.rod_steps[i], changed = self._rod_step(rod_step.group, means=means, counts_of=rod_step), True
         return changed
 
     def renew(self) -> None:
@@ -91,7 +91,7 @@ class DecoupledStep:
     def step(self, before, after) -> None:
         """Launch the step; worlds with pairs in range are solved by the coupled system."""
         step = self.step_of
-        inputs = [*step.islands.arrays, self._told, self._known]
+        inputs = [*step.islands.arrays, self._world_status, self._known]
         self._launch(self._begin, self.coupled.worlds, inputs, [step.remaining, self._again])
         if self.runs is None:
             self._by_pairs(before, after)
@@ -119,8 +119,8 @@ class DecoupledStep:
         for signal in (step.remaining, self._any_tried, self._some):
             signal.zero_()
         search.update(before.q)
-        search.measure(before.q, enough=search.reach)
-        inputs = [search.gap, search.reach, search.overflow, step.islands.arrays[1], self._told]
+        search.measure(before.q, enough=search.search_distance)
+        inputs = [search.gap, search.search_distance, search.overflow, step.islands.arrays[1], self._world_status]
         self._launch(self._hope, self.coupled.worlds, inputs, [self._any_tried, step.remaining])
         wp.capture_if(self._any_tried, lambda: self._try_and_search(before, after))
 
@@ -129,7 +129,12 @@ class DecoupledStep:
         self._try(before, after)
         if worlds > 1:
             device_arrays.sweep(
-                self._wait, blocks, [self._told, blocks, before.q], [after.q], self.coupled.device, worlds=worlds
+                self._wait,
+                blocks,
+                [self._world_status, blocks, before.q],
+                [after.q],
+                self.coupled.device,
+                worlds=worlds,
             )
         search.update(before.q, after.q, search.every)
         for pairs in search.lists:
@@ -142,7 +147,7 @@ class DecoupledStep:
     @timer("decoupled rods")
     def _try(self, before, after, test_runs=None) -> None:
         """Solve the rods of tried worlds once; `test_runs` reads positions only and runs in parallel with the remaining launches."""
-        rod_steps = list(zip(self.chains, self._states, self._places, self._kernels, strict=True))
+        rod_steps = list(zip(self.rod_steps, self._states, self._places, self._kernels, strict=True))
         for rod_step in rod_steps:
             self._solve(before, after, *rod_step)
         self._move(before, after)
@@ -155,10 +160,10 @@ class DecoupledStep:
         if self._mixed:
             self.coupled.update_strains(after)
 
-    def _solve(self, before, after, chain, state, places, rod_kernels) -> None:
+    def _solve(self, before, after, rod_step, state, places, rod_kernels) -> None:
         """Solve the rods of a group once, and write their positions."""
         gather, scatter_positions, _ = rod_kernels
-        group, world_status = chain.group, self._told
+        group, world_status = rod_step.group, self._world_status
         lists = [places.rows, group.count]
         rod_arrays = [state.x, state.v, state.theta, state.omega, state.frame, state.last, state.a, state.alpha]
         inputs = [
@@ -171,17 +176,17 @@ class DecoupledStep:
             before.a,
             *places.lagged(before),
         ]
-        self._launch(gather, group.node_threads, inputs, [*rod_arrays, *chain.islands.arrays])
-        chain.move(state, state)
-        inputs = [*lists, places.sizes, state.x, state.theta, chain.islands.arrays[0]]
+        self._launch(gather, group.node_threads, inputs, [*rod_arrays, *rod_step.islands.arrays])
+        rod_step.move(state, state)
+        inputs = [*lists, places.sizes, state.x, state.theta, rod_step.islands.arrays[0]]
         self._launch(scatter_positions, group.node_threads, inputs, [world_status, after.q])
 
-    def _complete(self, after, chain, state, places, rod_kernels) -> None:
+    def _complete(self, after, rod_step, state, places, rod_kernels) -> None:
         """Write all results of a rod group but positions."""
         *_, scatter = rod_kernels
-        chain.complete(state, state, state)
-        group, inputs = chain.group, [places.rows, chain.group.count, places.sizes, self.coupled.host.nodes]
-        inputs += [state.v, state.omega, state.frame, state.last, state.a, state.alpha, self._told]
+        rod_step.complete(state, state, state)
+        group, inputs = rod_step.group, [places.rows, rod_step.group.count, places.sizes, self.coupled.host.nodes]
+        inputs += [state.v, state.omega, state.frame, state.last, state.a, state.alpha, self._world_status]
         self._launch(scatter, group.node_threads, inputs, [after.v, after.a, *places.lagged(after)])
 
     def _move(self, before, after) -> None:
@@ -189,7 +194,10 @@ class DecoupledStep:
         step, blocks = self.step_of, self.coupled.blocks
         if not len(self._obstacles):
             return
-        dim, inputs = (len(self._obstacles), self.coupled.worlds), [self._obstacles, self._told, blocks, before.q]
+        dim, inputs = (
+            (len(self._obstacles), self.coupled.worlds),
+            [self._obstacles, self._world_status, blocks, before.q],
+        )
         self._launch(self._stay, dim, inputs, [after.q])
         if step.motion:
             step.motion.place(step.islands, after.q)
@@ -198,14 +206,22 @@ class DecoupledStep:
     def _judge_by(self, searched: int) -> None:
         """End the step of worlds without pairs in range, tested by bounds (`searched` 0) or by pairs (1)."""
         step, search = self.step_of, self._search
-        inputs = [searched, self._some, search.gap, search.reach, search.crossed, search.overflow, step.rounded]
-        inputs += [self._known, self._told, *step.islands.arrays, step.newton.contact.tally.counts]
+        inputs = [
+            searched,
+            self._some,
+            search.gap,
+            search.search_distance,
+            search.crossed,
+            search.overflow,
+            step.rounded,
+        ]
+        inputs += [self._known, self._world_status, *step.islands.arrays, step.newton.contact.tally.counts]
         outputs = [step.tally, step.work, step.remaining, self._again]
         self._launch(self._judge, self.coupled.worlds, inputs, outputs)
 
     def _measure(self, before, after) -> None:
-        self._search.passing(before.q, self.step_of.newton.contact.limit.keep)
-        self._search.measure(after.q, enough=self._search.reach)
+        self._search.passing(before.q, self.step_of.newton.contact.limit.min_separation_fraction)
+        self._search.measure(after.q, enough=self._search.search_distance)
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.model.wp_device)
@@ -252,7 +268,7 @@ class Places:
 def uncoupled(model) -> bool:
     """Return True if only contact couples the rods of a model, and all rods are open."""
     host, scene = model.coupled.host, model.scene
-    if not host.touching or not host.rods or any(rod.piece.kind.closed for rod in host.rods):
+    if not host.contact_parameters or not host.rods or any(rod.piece.kind.closed for rod in host.rods):
         return False
     return not any((scene.shells, scene.axisymmetric_shells, scene.joints, scene.attachments, scene.magnets))
 
@@ -266,8 +282,8 @@ def is_decoupled(integrator) -> bool:
 def rods_of(model) -> list[RodGroup]:
     """Return the rods of the coupled system as uncoupled rod groups."""
     real, device = model.types.real, model.wp_device
-    chains: list[RodGroupData] = compile_rod_groups(model.scene, coupled_rods(model.scene))
-    return [RodGroup(chain, model.scene, model.worlds, device, real) for chain in chains]
+    rod_steps: list[RodGroupData] = compile_rod_groups(model.scene, coupled_rods(model.scene))
+    return [RodGroup(rod_step, model.scene, model.worlds, device, real) for rod_step in rod_steps]
 
 
 def _evenly(indices: np.ndarray) -> tuple[int, int]:

@@ -64,7 +64,7 @@ class _Energy:
         self.failed = kept.failed if kept else make(2, count)
         self.sums = make(rows, energy_drift.ROWS, count)
         self.rows = self.sums.transpose((1, 0, 2))
-        self.floor = step.newton.options.floor_factor * self.model.types.eps
+        self.rounding_factor = step.newton.options.floor_factor * self.model.types.eps
         self._judge = energy_drift.drift_kernel(real)
 
     @property
@@ -110,12 +110,16 @@ class RodEnergy(_Energy):
         self._nodes = energy_drift.node_kernel(group.kind.nodes, real, group.kind.drag)
 
     @timer("energy")
-    def judge(self, before, start) -> None:
+    def check_drift(self, before, start) -> None:
         """Test the energy drift of the step from the state `before`, with the lagged data of `start`."""
         step, group, newton = self.step, self.step.group, self.step.newton
         if self._follows:
             step.loads.apply(newton.x, *self._loads)
-        grid, common, scalars = (self.ranges, group.columns), [self.floor, self.ranges], step.islands.arrays[1]
+        grid, common, scalars = (
+            (self.ranges, group.columns),
+            [self.rounding_factor, self.ranges],
+            step.islands.arrays[1],
+        )
         states = [group.element_inputs(state, start.last, step.islands.inverse_step) for state in (before, newton)]
         read = [*states, device_arrays.columns(newton.stiffness), scalars, *common]
         self._launch(self._elements[0], grid, read, [self.rows[:, : self.ranges]])
@@ -156,14 +160,14 @@ class CoupledEnergy(_Energy):
         return [*super().kernels, *(kernel for add in self._add for kernel in add.kernels)]
 
     @timer("energy")
-    def judge(self, before, middle) -> None:
+    def check_drift(self, before, middle) -> None:
         """Test the energy drift of the step from `before`, with the lagged data of `middle`."""
         step, coupled, newton = self.step, self.step.coupled, self.step.newton
         q, loading, outputs = newton.iterates.q, newton.loading, newton.elements.outputs
         points, scalars = coupled.points, step.islands.arrays[1]
         for i, (part, data, kernel) in enumerate(zip(coupled.sets, outputs, self._elements, strict=True)):
             states = [coupled.elements(middle, i, blocks, step.islands.inverse_step) for blocks in (before.q, q)]
-            read = [*states, data["stiffness"], scalars, self.floor, part.elements]
+            read = [*states, data["stiffness"], scalars, self.rounding_factor, part.elements]
             self._launch(kernel, (coupled.worlds, part.elements), read, [self._rows[i]])
         follows = bool(coupled.host.followers)
         if follows:
@@ -171,7 +175,7 @@ class CoupledEnergy(_Energy):
         read = [coupled.node_state(before), points(q), None, coupled.mass.transpose((1, 0)), None]
         read += [loading.mass.transpose((1, 0)) if step.drag else None, coupled.count]
         read += [points(self._load), None, points(loading.force), None, int(follows)]
-        read += [scalars, step.damping, self.floor, coupled.blocks]
+        read += [scalars, step.damping, self.rounding_factor, coupled.blocks]
         self._launch(self._nodes, (coupled.worlds, coupled.blocks), read, [self._rows[-1]])
         for add, values, out in zip(self._add, self._values, self._out, strict=True):
             add(values, out)

@@ -57,11 +57,11 @@ class Integrator:
             energy of linear oscillations).
         solver: "newton", or "projective": modified Newton, with the Hessian of the first iterate throughout a step.
         linear: linear solver. Rod groups take `"sweep"` (block LDL^T, with a Schur complement for closed rods) or, without closed
-            rods, `"partitioned"` (block cyclic reduction). The coupled system takes PCG with `"block_jacobi"`, `"chain"`
-            (substructuring), `"multilevel"` (fewer, longer iterations for large sheets) or `"chain_multilevel"` (both); rod groups
-            next to it then take `"auto"`. For rod groups `"auto"` takes the sweep, or cyclic reduction for few long rods on CUDA. For
-            the coupled system it decides by the number of nodes between joints and of other nodes. It also steps rods coupled by
-            contact alone as uncoupled rods, per world, while no pair is in range.
+            rods, `"cyclic_reduction"` (block cyclic reduction). The coupled system takes PCG with `"block_jacobi"`, `"rod_step"`
+            (substructuring), `"multilevel"` (fewer, longer iterations for large sheets) or `"substructuring_multilevel"` (both);
+            rod groups next to it then take `"auto"`. For rod groups `"auto"` takes the sweep, or cyclic reduction for few long rods
+            on CUDA. For the coupled system it decides by the number of nodes between joints and of other nodes. It also steps rods
+            coupled by contact alone as uncoupled rods, per world, while no pair is in range.
         rtol, max_iterations, ...: see `NewtonOptions`.
         retry_limit: consecutive retries of a failed step: first a cold start, then half the step, and so on, down to
             2^-(retry_limit / 2) of the step.
@@ -114,7 +114,7 @@ class Integrator:
             argument_checks.count("check_every", check_every)
         self.model, self.scheme, self.solver, self.linear = model, scheme, solver, linear
         self.options = argument_checks.options("Integrator", NewtonOptions, options, argument_checks.names(Integrator))
-        if self.options.unconverged_fraction and not model.scene.touching:
+        if self.options.unconverged_fraction and not model.scene.contact_parameters:
             raise SceneError(
                 f"unconverged_fraction = {self.options.unconverged_fraction!r} is for scenes with contact; "
                 "this one has none"
@@ -129,7 +129,7 @@ class Integrator:
         if model.magnetic:
             self.field = wp.zeros((3, model.worlds), dtype=model.types.real, device=model.wp_device)
         with memory.named("Integrator", model.wp_device):
-            self._chains = [RodStep(self, model, group) for group in model.groups]
+            self._rod_steps = [RodStep(self, model, group) for group in model.groups]
             self._coupled = CoupledStep(self, model) if model.coupled is not None else None
             self._worlds, self._first = WorldReset(model), (None, None)
             self._buffers = [StateBuffer(model), StateBuffer(model)]
@@ -181,7 +181,7 @@ class Integrator:
         """Launch the preparation of a step from an outside state in a buffer."""
         self.forget()
         before, after = self._buffers[source].own, self._buffers[1 - source].own
-        self._worlds.bar(self._parts, before, after, self._handed(after))
+        self._worlds.deactivate(self._parts, before, after, self._handed(after))
 
     def _handed(self, after: State) -> list[wp.array]:
         """Return the arrays of controls of a step to a state."""
@@ -261,7 +261,7 @@ class Integrator:
 
     def outcomes(self) -> np.ndarray:
         """Return the outcome of every world (worlds,): "converged", or the name of the outcome of its failure."""
-        return outcomes(self.model, self._parts, self._worlds.resting)
+        return outcomes(self.model, self._parts, self._worlds.outcome_codes)
 
     def failure(self, state: State, world: int) -> str:
         """Return the failed object of a world, the location of the failure and the remedy; empty without failure.
@@ -366,7 +366,9 @@ class Integrator:
 
     def _remake(self) -> None:
         """Rebuild all steppers, keeping counters."""
-        self._chains = [RodStep(self, self.model, part.group, part.means, counts_of=part) for part in self._chains]
+        self._rod_steps = [
+            RodStep(self, self.model, part.group, part.means, counts_of=part) for part in self._rod_steps
+        ]
         if self._coupled is not None:
             self._coupled = CoupledStep(self, self.model, self._coupled.means, counts_of=self._coupled)
         self._graphs.clear()
@@ -374,7 +376,7 @@ class Integrator:
     @property
     def _parts(self) -> list:
         """Steppers of the rod groups and of the coupled system."""
-        return self._chains if self._coupled is None else [*self._chains, self._coupled]
+        return self._rod_steps if self._coupled is None else [*self._rod_steps, self._coupled]
 
     def _solved(self, dt: float) -> float:
         """Return the length [s] of the implicit Euler step solved in a step of dt; see `kernels.stepping.time_step`."""
@@ -398,9 +400,11 @@ class Integrator:
 
     def _adapt(self, s: float, changed: bool = False) -> None:
         """Select the solver for steps of s [s] and, unless parameters have `changed`, for earlier ones; see `LinearSolverChoice`."""
-        for i, chain in enumerate(self._chains):
-            if (means := chain.choose_solver(s, changed)) != chain.means or (changed and chain.newton.outdated):
-                self._chains[i] = RodStep(self, self.model, chain.group, means, counts_of=chain)
+        for i, rod_step in enumerate(self._rod_steps):
+            if (means := rod_step.choose_solver(s, changed)) != rod_step.means or (
+                changed and rod_step.newton.outdated
+            ):
+                self._rod_steps[i] = RodStep(self, self.model, rod_step.group, means, counts_of=rod_step)
                 self._graphs.clear()
         coupled = self._coupled
         if coupled is not None and (
@@ -458,15 +462,15 @@ class Integrator:
                 part.motion.follow(before, after)
             if self.given is not None:
                 part.loads.give()
-        start = self._gyroscope.begin(before, self._chains, self._coupled) if self._spinning else before
-        for chain in self._chains:
+        start = self._gyroscope.begin(before, self._rod_steps, self._coupled) if self._spinning else before
+        for rod_step in self._rod_steps:
             with timer("rod group"):
-                chain.step(start.groups[chain.index], after.groups[chain.index])
+                rod_step.step(start.groups[rod_step.index], after.groups[rod_step.index])
         if self._coupled is not None:
             with timer("coupled system"):
                 self._coupled.step(start.coupled, after.coupled)
         if self._spinning:
-            self._gyroscope.finish(after, self._chains, self._coupled)
+            self._gyroscope.finish(after, self._rod_steps, self._coupled)
         if self.failures == "flag":
             self._worlds.settle(self._parts, before, after)
         if self._changes:

@@ -22,7 +22,7 @@ from ddg_warp.solve.newton.rod_newton_parallel import RodNewtonParallel
 from ddg_warp.solve.stepping import energy_drift
 from ddg_warp.solve.stepping.step_driver import USUAL, StepDriver
 
-DIRECT = {"sweep": RodNewton, "partitioned": RodNewtonParallel}  # solvers of open rods by their name
+DIRECT = {"sweep": RodNewton, "cyclic_reduction": RodNewtonParallel}  # solvers of open rods by their name
 
 
 class RodStep(StepDriver):
@@ -192,7 +192,7 @@ def _newton(model, group, integrator, means) -> RodNewton:
     if integrator.solver == "projective":
         return RodModifiedNewton(*arguments, *last)
     if not group.kind.closed:
-        return DIRECT[linear](*arguments, *last, split=means.split)
-    if linear == "partitioned":
-        raise SceneError(f"linear 'partitioned': rod {group.host.rods[0]} is closed; use 'auto' or 'sweep'")
+        return DIRECT[linear](*arguments, *last, mixed_axial=means.mixed_axial)
+    if linear == "cyclic_reduction":
+        raise SceneError(f"linear 'cyclic_reduction': rod {group.host.rods[0]} is closed; use 'auto' or 'sweep'")
     return EliminationNewton(*arguments, *last)

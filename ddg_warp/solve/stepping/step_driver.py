@@ -27,15 +27,15 @@ class LinearSolverChoice(NamedTuple):
     Attributes:
         linear: scalar type of the linear algebra; None for the type of the model.
         stiff: True if a rod is stiff over the step; see `compile.precision.stiff`.
-        split: True for the mixed axial-force formulation; see `kernels.linear.mixed_axial_force`.
+        mixed_axial: True for the mixed axial-force formulation; see `kernels.linear.mixed_axial_force`.
     """
 
     linear: type | None = None
     stiff: bool = False
-    split: bool = False
+    mixed_axial: bool = False
 
     def __str__(self) -> str:
-        return self.linear.__name__ + self.split * " with tensions"
+        return self.linear.__name__ + self.mixed_axial * " with tensions"
 
 
 USUAL = LinearSolverChoice()
@@ -43,11 +43,11 @@ USUAL = LinearSolverChoice()
 
 def choose_solver(precision: str, before: LinearSolverChoice, errors: float, split_errors: float) -> LinearSolverChoice:
     """Return the solver selection for float32 errors without and with the mixed formulation, and for `before`."""
-    linear, was_stiff, split = before
+    linear, was_stiff, mixed_axial = before
     if precision == "mixed" and errors > FLOAT32_LIMIT:
-        split = linear is wp.float32 and bool(split_errors <= FLOAT32_LIMIT)
-        linear = wp.float32 if split else wp.float64
-    return LinearSolverChoice(linear, was_stiff or bool(stiff(errors)), split)
+        mixed_axial = linear is wp.float32 and bool(split_errors <= FLOAT32_LIMIT)
+        linear = wp.float32 if mixed_axial else wp.float64
+    return LinearSolverChoice(linear, was_stiff or bool(stiff(errors)), mixed_axial)
 
 
 class StepDriver:
@@ -197,7 +197,7 @@ class StepDriver:
         if contact:
             contact.finish(before.q, newton.iterates, self.islands)  # interpenetration check
         if self.energy:
-            self.energy.judge(before, start)
+            self.energy.check_drift(before, start)
         with timer("finish"):  # positions, velocities and accelerations of accepted substeps
             self.finish(before, after)
         return start

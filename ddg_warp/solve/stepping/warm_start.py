@@ -47,8 +47,8 @@ class WarmStart:
             [points(iterates.q), None, points(self.predicted), None, coupled.components(system.direction)],
             device=coupled.device,
         )
-        if newton.turns:
-            newton.turns.go_further(before, self.predicted, iterates, system, islands)
+        if newton.edge_rotations:
+            newton.edge_rotations.go_further(before, self.predicted, iterates, system, islands)
 
     def weigh(self, before) -> None:
         """Find the trusted fraction of the solve's correction, in systems with contact."""

@@ -11,9 +11,9 @@ from ddg_warp.kernels.stepping.world_reset import blank_kernels, forget_kernel, 
 from ddg_warp.model.state import State
 
 
-def outcomes(model, parts: list, resting: wp.array) -> np.ndarray:
+def outcomes(model, parts: list, outcome_codes: wp.array) -> np.ndarray:
     """Return the outcome of each world (worlds,): of its first failure, or "converged"."""
-    codes = resting.numpy()
+    codes = outcome_codes.numpy()
     for part in parts:
         islands = part.islands
         given_up = islands.status.numpy() == outcome.STEP_FAILED
@@ -30,14 +30,14 @@ class WorldReset:
     instead.
 
     Attributes:
-        resting: outcome code of each inactive world, 0 for active ones (worlds,); see `kernels.core.outcome`.
+        outcome_codes: outcome code of each inactive world, 0 for active ones (worlds,); see `kernels.core.outcome`.
         invalid: outcome code of each watched world with refused parameters, else 0 (worlds,).
         start: state for watched worlds excluded from a step.
     """
 
     def __init__(self, model):
         self.model = model
-        self.resting, self._failed, self._mask = (self._zeros(model.worlds) for _ in range(3))
+        self.outcome_codes, self._failed, self._mask = (self._zeros(model.worlds) for _ in range(3))
         self._any = self._zeros(1)
         self._note, self._seal, self._enter, self._clear, self._find = island_kernels()
         self._serial, self._loaded = device_arrays.serial(model.wp_device), False
@@ -51,7 +51,7 @@ class WorldReset:
         """Watch worlds: exclude worlds with `invalid` parameters or a NaN state from steps; failed worlds become NaN."""
         self.invalid, self.start = self._zeros(self.model.worlds), self.model.state()
 
-    def bar(self, parts: list, before: State, after: State, handed: list[wp.array]) -> None:
+    def deactivate(self, parts: list, before: State, after: State, handed: list[wp.array]) -> None:
         """Exclude invalid watched worlds from a step and set the start state; capturable.
 
         Args:
@@ -62,23 +62,23 @@ class WorldReset:
         # in worlds that failed in the last step, padding entries stay NaN, which a step does not write
         wp.capture_if(self._any, lambda: self.take_over(self._failed, self.start, after))
         values, worlds = next(array for array in before.arrays().values() if array.size > 1), self.model.worlds
-        cube, (_, bar, _) = cubed(values), blank_kernels(values.dtype)
-        self._launch(bar, worlds, [self.invalid, cube, cube.shape[-1] // worlds], [self.resting])
+        cube, (_, deactivate, _) = cubed(values), blank_kernels(values.dtype)
+        self._launch(deactivate, worlds, [self.invalid, cube, cube.shape[-1] // worlds], [self.outcome_codes])
         for array in handed:
-            cube, (*_, judge) = cubed(array), blank_kernels(array.dtype)
-            self._launch(judge, cube.shape, [cube, cube.shape[-1] // worlds], [self.resting])
+            cube, (*_, find_non_finite) = cubed(array), blank_kernels(array.dtype)
+            self._launch(find_non_finite, cube.shape, [cube, cube.shape[-1] // worlds], [self.outcome_codes])
         self._any.zero_()
-        self._launch(self._find, worlds, [self.resting], [self._any])
+        self._launch(self._find, worlds, [self.outcome_codes], [self._any])
         wp.capture_if(self._any, lambda: self._to_start(before, after))
         for part in parts:
-            inputs = [self.resting, part.islands_each]
+            inputs = [self.outcome_codes, part.islands_each]
             self._launch(self._seal, len(part.islands), inputs, [part.islands.arrays[0]])
 
     def _to_start(self, before: State, after: State) -> None:
         """Set inactive worlds to the start state, grips included, since the broad phase covers all worlds."""
-        self.take_over(self.resting, self.start, before)
+        self.take_over(self.outcome_codes, self.start, before)
         if after.grips is not None:
-            self.take_part(self.resting, self.start.grips, after.grips, self.model.worlds)
+            self.take_part(self.outcome_codes, self.start.grips, after.grips, self.model.worlds)
 
     def settle(self, parts: list, before: State, after: State) -> None:
         """Deactivate worlds with failures after a step; capturable."""
@@ -86,14 +86,14 @@ class WorldReset:
         if self.invalid is None:
             self._failed.zero_()
         else:
-            wp.copy(self._failed, self.resting)
+            wp.copy(self._failed, self.outcome_codes)
             self._launch(self._find, self.model.worlds, [self._failed], [self._any])
         for part in parts:
-            inputs = [part.islands.arrays[0], part.islands_each, self.resting, self._failed]
+            inputs = [part.islands.arrays[0], part.islands_each, self.outcome_codes, self._failed]
             self._launch(self._note, len(part.islands), inputs, [self._any])
         wp.capture_if(self._any, lambda: self._rest(parts, before, after))
         if after.grips is not None and self.invalid is None:  # controls move grips, except in inactive worlds
-            self.take_part(self.resting, before.grips, after.grips, before.model.worlds)
+            self.take_part(self.outcome_codes, before.grips, after.grips, before.model.worlds)
 
     def _rest(self, parts: list, before: State, after: State) -> None:
         if self.invalid is None:
@@ -103,7 +103,7 @@ class WorldReset:
         for part in parts:
             inputs = [self._failed, part.islands_each]
             self._launch(self._seal, len(part.islands), inputs, [part.islands.arrays[0]])
-        self._launch(self._enter, self.model.worlds, [self._failed], [self.resting])
+        self._launch(self._enter, self.model.worlds, [self._failed], [self.outcome_codes])
 
     def _blank(self, state: State) -> None:
         """Set a state to NaN in failed worlds."""
@@ -176,7 +176,7 @@ class WorldReset:
     def reset(self, parts: list, mask: wp.array, to: State, target: State) -> None:
         """Set masked worlds to the state `to`, and clear their outcomes."""
         self.take_over(mask, to, target)
-        self._launch(forget_kernel(int), (1, self.model.worlds), [mask, 1], [self.resting.reshape((1, -1))])
+        self._launch(forget_kernel(int), (1, self.model.worlds), [mask, 1], [self.outcome_codes.reshape((1, -1))])
         for part in parts:
             self._launch(self._clear, len(part.islands), [mask, part.islands_each], [part.islands.arrays[0]])
             for account in (part.energy.account, part.energy.failed) if part.energy else ():
@@ -185,7 +185,7 @@ class WorldReset:
 
     def forget(self, parts: list) -> None:
         """Activate all worlds and clear all outcomes."""
-        self.resting.zero_()
+        self.outcome_codes.zero_()
         for part in parts:
             part.islands.status.fill_(outcome.CONVERGED)
             part.islands.failure_status.zero_()

@@ -1,6 +1,6 @@
 """Candidate pairs: broad phase by a BVH, narrow phase by distance, and lists sorted by index.
 
-The broad phase (`meet`) and the narrow phase (`judge`) are separate kernels: a BVH traversal waits for memory, and takes so few
+The broad phase (`meet`) and the narrow phase (`narrow_phase`) are separate kernels: a BVH traversal waits for memory, and takes so few
 registers that many threads wait at once. A leaf of the BVH has consecutive edges of a rod, which need one traversal. The narrow
 phase tests all pairs of primitives of two leaves whose AABBs overlap.
 
@@ -191,7 +191,7 @@ def query_functions(kind: Kind, real, single: bool):
 def candidate_kernels(kind: Kind, real, single: bool):
     """Build the kernels of the narrow phase.
 
-    `judge`: link and count the candidates among primitives of leaf pairs.
+    `narrow_phase`: link and count the candidates among primitives of leaf pairs.
     `fill`: write the candidate list.
 
     `single`: see `query_functions`.
@@ -228,7 +228,7 @@ def candidate_kernels(kind: Kind, real, single: bool):
         return first - second - two * around
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def judge(
+    def narrow_phase(
         threads: int,
         sides: Sides,
         trees: BvhPair,
@@ -236,7 +236,7 @@ def candidate_kernels(kind: Kind, real, single: bool):
         x: wp.array(dtype=X),
         move: wp.array(dtype=X),
         together: wp.array(dtype=int),
-        reach: real,
+        search_distance: real,
         around: real,
         num_met: wp.array(dtype=int),
         leaf_pairs: wp.array(dtype=wp.vec2i),
@@ -246,7 +246,7 @@ def candidate_kernels(kind: Kind, real, single: bool):
         overflow: wp.array(dtype=int),
         needed: wp.array(dtype=int),
     ):
-        """Link and count, by first primitive, pairs whose gap may fall below `reach` [m] in the motion."""
+        """Link and count, by first primitive, pairs whose gap may fall below `search_distance` [m] in the motion."""
         if wp.tid() == 0:
             note_needed(num_met, leaf_pairs, overflow, needed)
         begin, stop, step = turns(wp.tid(), threads, num_met, leaf_pairs)
@@ -261,7 +261,7 @@ def candidate_kernels(kind: Kind, real, single: bool):
                         y, p = corners(x, nodes), corners(move, nodes)
                         if together[w] != 0:
                             p, _speed = relative(y, p)
-                        if separation(y, p, around) <= thickness(sides, k, l, w) + reach:
+                        if separation(y, p, around) <= thickness(sides, k, l, w) + search_distance:
                             i = k + w * sides.counts[0]
                             link_index = (n * wide[0] + k - start) * wide[1] + l - first
                             links[link_index] = wp.vec2i(
@@ -304,4 +304,4 @@ def candidate_kernels(kind: Kind, real, single: bool):
                 end += 1
                 entry = link[1]
 
-    return judge, fill
+    return narrow_phase, fill

@@ -25,7 +25,7 @@ IN_CONTACT = 1e-9  # distance at which a pair crosses, over its size
 
 @cache
 def impact_functions(kind: Kind, real):
-    """Return the device functions `impact(x, p, thickness, reach) -> t` and `meet(x, p, thickness) -> bool`.
+    """Return the device functions `impact(x, p, thickness, search_distance) -> t` and `meet(x, p, thickness) -> bool`.
 
     `impact`: time of impact; `meet`: True if the distance falls to the thickness [m]. x, p (4, 3): positions and displacements [m].
     """
@@ -33,7 +33,7 @@ def impact_functions(kind: Kind, real):
     *_, closest = pair_functions(kind, real)
     relative = relative_function(kind, real)
     # rounding of a distance in this precision
-    touching = IN_CONTACT if real is wp.float64 else 1e3 * IN_CONTACT
+    contact_tolerance = IN_CONTACT if real is wp.float64 else 1e3 * IN_CONTACT
 
     @wp.func
     def distance(x: Y, q: Y, t: real):
@@ -41,7 +41,7 @@ def impact_functions(kind: Kind, real):
         return wp.length(r)
 
     @wp.func
-    def impact(x: Y, p: Y, thickness: real, reach: real):
+    def impact(x: Y, p: Y, thickness: real, search_distance: real):
         """Return the time of impact in [0, 1], 2 for none, or 0 if the pair overlaps at the start."""
         q, speed = relative(x, p)
         gap = distance(x, q, real(0.0)) - thickness
@@ -49,7 +49,7 @@ def impact_functions(kind: Kind, real):
             return real(0.0)
         if speed == real(0.0):
             return real(2.0)
-        least, t = wp.max(real(REST) * gap, real(NEAR) * wp.min(gap, reach)), real(0.0)
+        least, t = wp.max(real(REST) * gap, real(NEAR) * wp.min(gap, search_distance)), real(0.0)
         safe = (gap - least) / gap
         step = safe * gap / speed
         for _ in range(wp.static(PARTS)):
@@ -72,7 +72,7 @@ def impact_functions(kind: Kind, real):
             size += distance(x, q, real(0.0))
         else:
             size += wp.length(x[1] - x[0]) + wp.length(x[2] - x[1]) + wp.length(x[3] - x[2])
-        least, t = thickness + real(touching) * size, real(0.0)
+        least, t = thickness + real(contact_tolerance) * size, real(0.0)
         for _ in range(wp.static(MAX_STEPS)):
             separation = distance(x, q, t)
             if separation <= least:
@@ -108,8 +108,8 @@ def impact_kernel(kind: Kind, passing: bool, real, single: bool):
         leaf_pairs: wp.array(dtype=wp.vec2i),
         x: wp.array(dtype=X),
         move: wp.array(dtype=X),
-        keep: real,
-        reach: real,
+        min_separation_fraction: real,
+        search_distance: real,
         time: wp.array(dtype=real),
         number: wp.array(dtype=int),
         least: wp.array(dtype=wp.int64),
@@ -136,7 +136,7 @@ def impact_kernel(kind: Kind, passing: bool, real, single: bool):
                             key = wp.int64(i) * wp.int64(sides.counts[1] * number.shape[0]) + wp.int64(j)
                             wp.atomic_min(least, 0, key)
                     else:
-                        t = impact(y, p, keep * thickness(sides, k, l, w), reach)
+                        t = impact(y, p, min_separation_fraction * thickness(sides, k, l, w), search_distance)
                         if t < real(1.0):
                             wp.atomic_min(time, w, t)
 
@@ -147,8 +147,8 @@ def impact_kernel(kind: Kind, passing: bool, real, single: bool):
 def passing_kernel(kind: Kind, real):
     """Build the kernel of the crossing test.
 
-    `passing`: count the pairs of a list that cross or, with `keep`, whose distance falls below `keep` of the thickness plus `BESIDE` of
-    `reach` [m].
+    `passing`: count the pairs of a list that cross or, with `min_separation_fraction`, whose distance falls below
+        `min_separation_fraction` of the thickness plus `BESIDE` of `search_distance` [m].
     """
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     pair_nodes, _, thickness, _ = pair_functions(kind, real)
@@ -163,16 +163,16 @@ def passing_kernel(kind: Kind, real):
         sides: Sides,
         x: wp.array(dtype=X),
         move: wp.array(dtype=X),
-        keep: real,
-        reach: real,
+        min_separation_fraction: real,
+        search_distance: real,
         number: wp.array(dtype=int),
     ):
         for p in range(wp.tid(), count[0], threads):
             w, i, j = locate(sides, pairs[p])
             nodes = pair_nodes(sides, i, j, w)
             near = real(0.0)
-            if keep > real(0.0):
-                near = keep * (thickness(sides, i, j, w) + real(wp.static(BESIDE)) * reach)
+            if min_separation_fraction > real(0.0):
+                near = min_separation_fraction * (thickness(sides, i, j, w) + real(wp.static(BESIDE)) * search_distance)
             if meet(corners(x, nodes), corners(move, nodes), near):
                 wp.atomic_add(number, w, 1)
 

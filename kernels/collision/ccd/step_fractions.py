@@ -40,8 +40,8 @@ def limit_kernels(kind: Kind, real):
         pairs: wp.array(dtype=wp.vec2i),
         count: wp.array(dtype=int),
         sides: Sides,
-        unit: wp.array(dtype=int),
-        units: int,
+        ccd_body: wp.array(dtype=int),
+        num_ccd_bodies: int,
         shares: wp.array(dtype=real),
         before: wp.array(dtype=real),
         picked: wp.array(dtype=int),
@@ -53,9 +53,9 @@ def limit_kernels(kind: Kind, real):
             nodes = pair_nodes(sides, i, j, w)
             changed = int(0)
             for k in range(4):
-                body = unit[nodes[k] - w * sides.first.nodes_a_world]
+                body = ccd_body[nodes[k] - w * sides.first.nodes_a_world]
                 if body >= 0:
-                    if shares[body + w * units] != before[body + w * units]:
+                    if shares[body + w * num_ccd_bodies] != before[body + w * num_ccd_bodies]:
                         changed = 1
             if changed != 0:
                 picked[wp.atomic_add(number, 0, 1)] = p
@@ -71,10 +71,10 @@ def limit_kernels(kind: Kind, real):
         sides: Sides,
         x: wp.array(dtype=X),
         move: wp.array(dtype=X),
-        keep: real,
-        reach: real,
-        unit: wp.array(dtype=int),
-        units: int,
+        min_separation_fraction: real,
+        search_distance: real,
+        ccd_body: wp.array(dtype=int),
+        num_ccd_bodies: int,
         shares: wp.array(dtype=real),
         lowered: wp.array(dtype=real),
         time: wp.array(dtype=real),
@@ -90,16 +90,16 @@ def limit_kernels(kind: Kind, real):
             body = wp.vec4i()
             least, most = real(1.0), real(-1.0)
             for k in range(4):
-                body[k] = unit[nodes[k] - w * sides.first.nodes_a_world]
+                body[k] = ccd_body[nodes[k] - w * sides.first.nodes_a_world]
                 if body[k] >= 0:
-                    body[k] += w * units
+                    body[k] += w * num_ccd_bodies
                     s[k] = shares[body[k]]
                     least, most = wp.min(least, s[k]), wp.max(most, s[k])
             if most < real(0.0):  # no node belongs to a CCD body
                 continue
             m = corners(move, nodes)
             m = wp.matrix_from_rows(s[0] * m[0], s[1] * m[1], s[2] * m[2], s[3] * m[3])
-            t = impact(corners(x, nodes), m, keep * thickness(sides, i, j, w), reach)
+            t = impact(corners(x, nodes), m, min_separation_fraction * thickness(sides, i, j, w), search_distance)
             if t < real(1.0):
                 wp.atomic_min(time, w, t)
                 if most == least:
@@ -193,8 +193,8 @@ def fraction_kernels(real, serial: bool):
     def shorten(
         base: wp.array(dtype=X),
         move: wp.array(dtype=X),
-        unit: wp.array(dtype=int),
-        units: int,
+        ccd_body: wp.array(dtype=int),
+        num_ccd_bodies: int,
         shares: wp.array(dtype=real),
         done: wp.array(dtype=int),
         together: wp.array(dtype=int),
@@ -205,10 +205,10 @@ def fraction_kernels(real, serial: bool):
         """Limit positions `q`, and the searched paths of worlds that move by one fraction if a search was `done`."""
         tid = wp.tid()
         for i in range(tid, until(tid, q.shape[0])):
-            w = i / unit.shape[0]
-            body = unit[i - w * unit.shape[0]]
+            w = i / ccd_body.shape[0]
+            body = ccd_body[i - w * ccd_body.shape[0]]
             if body >= 0:
-                s = shares[w * units + body]
+                s = shares[w * num_ccd_bodies + body]
                 if s < real(1.0):
                     q[i] = base[i] + s * move[i]
             if together[w] != 0 and done[0] != 0:

@@ -151,7 +151,7 @@ def set_struct(real, linear):
     `kind`: index in `geometric_stiffness.KINDS`, -1 without `bend`.
     `edges`: number of leading primitives of a pair that are edges.
     `rows`: number of factor rows.
-    `things`: number of first primitives in one world.
+    `primitives`: number of first primitives in one world.
     """
     X, V, R = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.vector(ROW, linear)
     A, W = wp.types.vector(ANGLES, linear), wp.types.vector(PLACED, linear)
@@ -180,7 +180,7 @@ def set_struct(real, linear):
         kind: int
         edges: int
         rows: int
-        things: int
+        primitives: int
 
     return PairSet
 

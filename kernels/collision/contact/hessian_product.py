@@ -132,7 +132,7 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
                         store_angles(pair_set, p, z)
                     if wanted.shape[0] > 0 and pair_set.kind >= 0:
                         c = pair_set.bend[p]
-                        if c != linear(0.0) and wanted[pair_set.pairs[p][0] / pair_set.things] != 0:
+                        if c != linear(0.0) and wanted[pair_set.pairs[p][0] / pair_set.primitives] != 0:
                             o = x[n[0]]
                             y0 = wp.matrix_from_rows(
                                 V(), difference(x[n[1]], o), difference(x[n[2]], o), difference(x[n[3]], o)

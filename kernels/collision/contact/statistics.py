@@ -24,7 +24,7 @@ def take_kernel(real):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def take(
-        touching: wp.array(dtype=int),
+        active_pairs: wp.array(dtype=int),
         dissipated: wp.array(dtype=real),
         flags: wp.array2d(dtype=int),
         counts: wp.array2d(dtype=wp.int64),
@@ -32,9 +32,9 @@ def take_kernel(real):
     ):
         w = wp.tid()
         if flags[SUBSTEP_ACCEPTED, w] != 0 and flags[STATUS, w] <= wp.static(outcome.CONVERGED_TO_ROUNDING):
-            counts[wp.static(SUM), w] = counts[wp.static(SUM), w] + wp.int64(touching[w])
+            counts[wp.static(SUM), w] = counts[wp.static(SUM), w] + wp.int64(active_pairs[w])
             counts[wp.static(PARTS), w] = counts[wp.static(PARTS), w] + wp.int64(1)
-            counts[wp.static(LAST), w] = wp.int64(touching[w])
+            counts[wp.static(LAST), w] = wp.int64(active_pairs[w])
             work[w] = work[w] + wp.float64(dissipated[w])
 
     return take

@@ -12,7 +12,7 @@ ROWS = 3
 
 @cache
 def written_struct(real):
-    """List of pairs with energies, by first primitives, `things` in a world; see `CandidateList`.
+    """List of pairs with energies, by first primitives, `primitives` in a world; see `CandidateList`.
 
     `used`: not zero for active pairs; `work`: work of friction, empty for contact.
     """
@@ -25,7 +25,7 @@ def written_struct(real):
         energy: wp.array(dtype=real)
         used: wp.array(dtype=int)
         work: wp.array(dtype=real)
-        things: int
+        primitives: int
 
     return Written
 
@@ -44,20 +44,20 @@ def total_kernels(real, serial: bool):
         """Write sums (ROWS worlds, primitives); column k adds the k-th first primitives of all lists."""
         w, start = share(wp.tid(), sums.shape[1])
         for k in range(start, until(start, sums.shape[1])):
-            energy, work, touching = real(0.0), real(0.0), int(0)
+            energy, work, active_pairs = real(0.0), real(0.0), int(0)
             for s in range(lists.shape[0]):
-                if k < lists[s].things and lists[s].count[0] > 0:
+                if k < lists[s].primitives and lists[s].count[0] > 0:
                     pair_list = lists[s]
-                    first = pair_list.starts[k + w * pair_list.things]
-                    for p in range(first, first + pair_list.partners[k + w * pair_list.things]):
+                    first = pair_list.starts[k + w * pair_list.primitives]
+                    for p in range(first, first + pair_list.partners[k + w * pair_list.primitives]):
                         if pair_list.used[p] != 0:
                             energy += pair_list.energy[p]
                             if pair_list.work.shape[0] > 0:
                                 work += pair_list.work[p]
                             else:
-                                touching += 1
+                                active_pairs += 1
             sums[wp.static(ENERGY) * worlds + w, k] = energy
-            sums[wp.static(ACTIVE_PAIRS) * worlds + w, k] = real(touching)
+            sums[wp.static(ACTIVE_PAIRS) * worlds + w, k] = real(active_pairs)
             sums[wp.static(WORK) * worlds + w, k] = work
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -65,13 +65,13 @@ def total_kernels(real, serial: bool):
         sums: wp.array2d(dtype=real),
         overflow: wp.array(dtype=int),
         energy: wp.array(dtype=real),
-        touching: wp.array(dtype=int),
+        active_pairs: wp.array(dtype=int),
         dissipated: wp.array(dtype=real),
     ):
         """Write the results of each world; energies are infinite if pairs overflowed."""
         w = wp.tid()
         energy[w] = wp.where(overflow[0] == 0, sums[wp.static(ENERGY), w], real(wp.inf))
-        touching[w] = int(sums[wp.static(ACTIVE_PAIRS), w])
+        active_pairs[w] = int(sums[wp.static(ACTIVE_PAIRS), w])
         dissipated[w] = sums[wp.static(WORK), w]
 
     return add, tell

@@ -22,7 +22,7 @@ def spin_kernels(real):
     """Build the kernels of phi and of the vector-Jacobian product.
 
     `turn`: write phi of each rotating body in all worlds.
-    `pull`: add the gradients by positions and radii, given the gradients by phi and R.
+    `vjp`: add the gradients by positions and radii, given the gradients by phi and R.
     """
     V = wp.types.vector(3, real)
 
@@ -65,7 +65,7 @@ def spin_kernels(real):
             phi[w, body] = total * inverse_square(x, indices, shift)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def pull(
+    def vjp(
         spinning: wp.array(dtype=wp.vec4i),
         nodes: int,
         start: wp.array(dtype=V),
@@ -91,4 +91,4 @@ def spin_kernels(real):
                 add_arm_gradient(by_start, indices, shift, k, wp.cross(arm(x, indices, shift, k), by_phi))
                 add_arm_gradient(by_x, indices, shift, k, wp.cross(by_phi, arm(start, indices, shift, k)))
 
-    return turn, pull
+    return turn, vjp
