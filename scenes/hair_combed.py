@@ -48,7 +48,7 @@ def build(
         seed: seed of the random phases of the curls
     """
     duration = np.ceil((LENGTH + LEAVES - BEGINS) / speed / dt) * dt
-    points = _layouts.resolve_overlaps(curled(gaps, rows, n, _layouts.random(seed)), APART, held=2)
+    points = _layouts.resolve_overlaps(curled(gaps, rows, n, _layouts.random(seed)), APART, num_fixed=2)
     scene = ddg.Scene(mass_damping=damping, analysis=ddg.Dynamics(dt=dt, duration=duration))
     hair = scene.add_rods(points, section=ddg.Circle(RADIUS), material=HAIR, name="hair")
     scene.clamp(hair, edges=[0])

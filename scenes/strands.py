@@ -63,7 +63,7 @@ def build(
     points[:, HELD:] += 0.2 * thin * _many_rods.jitter(points[:, HELD:].shape, seed)
     distance = 2.0 * thin * (1.0 + CLEAR)  # distance of centrelines at the start
     if contact:
-        points = _layouts.resolve_overlaps(points, distance, held=HELD)
+        points = _layouts.resolve_overlaps(points, distance, num_fixed=HELD)
     scene = ddg.Scene(
         mass_damping=0.4,  # 1/s, drag of the air
         analysis=ddg.Dynamics(dt=1.0 / STEPS[contact], duration=REST, rtol=RTOL[contact], precision=PRECISION[contact]),

@@ -100,7 +100,7 @@ def test_twist_kernels_are_launched_only_for_rods_with_twist(device, launched, o
     words = {word for text in code.values() for word in TWIST if word in text}
     names = {key.split("_kernel")[0] for key in code}
     assert model.groups[0].kind.block == block
-    assert {"evaluate", "sweep", "begin", "finish_nodes", "advance"} <= names
+    assert {"evaluate", "sweep", "begin", "finish", "advance"} <= names
     if block == 4:
         assert words == set(TWIST)
         assert "finish_frames" in names

@@ -39,7 +39,7 @@ class Contacts:
 
 @dataclass(frozen=True)
 class ContactScales:
-    """Names and typical scales of contact, for recordings; `Model.contact_parameters`.
+    """Names and typical scales of contact, for recordings; `Model.contact_scales`.
 
     Attributes:
         names: of objects with contact, as in `Contacts`.

@@ -7,7 +7,7 @@
                   obstacles; contacts/{world, objects, point, gap, force, friction} (n, ...) if wanted, pairs of all frames
                   one after the other, up to contacts/ends[f] for frame f
     /model        curves/{counts, closed, radius, names, batch}, surfaces/{triangles, first, names, thickness} if there are
-                  any, obstacles/{...}, see `Obstacles`, touching/{names, size, force}, see `ContactParameters`, parameters/NAME,
+                  any, obstacles/{...}, see `Obstacles`, touching/{names, size, force}, see `ContactScales`, parameters/NAME,
                   attributes/NAME of rods
     /control      options of the run
     /checkpoint   a and b, alternately the state at the last frame, at full precision; the attribute current names the last;
@@ -335,9 +335,9 @@ def _other(reader: TrajectoryReader, model) -> tuple[str, str] | None:
     for name in CURVE_FIELDS:
         if not _equal(getattr(reader.curves, name), getattr(model.curves, name)):
             return "rods", name
-    for kind in ("surfaces", "obstacles", "touching"):
+    for kind in ("surfaces", "obstacles", "contact_scales"):
         recorded, wanted = getattr(reader, kind), getattr(model, kind)
-        kind = "contact" if kind == "touching" else kind
+        kind = "contact" if kind == "contact_scales" else kind
         if recorded is None or wanted is None:
             if recorded is not wanted:
                 return kind, ""

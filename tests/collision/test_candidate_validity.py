@@ -44,7 +44,7 @@ def test_cut_motion_continues_without_a_new_search(device, kind, dtype):
     shapes, points = tangle(5)
     rng = np.random.default_rng(21)
     motion = Motion(shapes, points, device, kind, dtype=dtype)
-    move = rng.normal(size=(motion.units, 3))[motion.unit.numpy()] * 6.0 * MARGIN
+    move = rng.normal(size=(motion.num_ccd_bodies, 3))[motion.ccd_body.numpy()] * 6.0 * MARGIN
     positions = motion(move).astype(float)
     assert (motion.search.shares.numpy() < 1.0).sum() > 3
     first = motion.search.searches.numpy()[0]

@@ -69,7 +69,7 @@ def test_blocks_and_stiffness_equal_the_matrix(device, form):
         blocks = matrix[np.arange(n), np.arange(n)]
         assert np.abs(diagonal - blocks).max() < 1e-13 * largest
         assert np.abs(between - matrix[nodes[:, 0], nodes[:, 1]]).max() < 1e-13 * largest
-        assert np.abs(result.stiffness.numpy() - np.trace(blocks, axis1=1, axis2=2)).max() < 1e-13 * largest
+        assert np.abs(result.blocks.stiffness.numpy() - np.trace(blocks, axis1=1, axis2=2)).max() < 1e-13 * largest
         along = np.abs(between[:, 0, 0]).max()  # rods lie along x
         assert along < 1e-3 * largest if rate is None else along > 1e-2 * largest
 

@@ -54,7 +54,7 @@ def test_internal_contact_conserves_momentum(device, friction, law):
     for _ in range(40):
         before, state = state.velocities(), integrator.step(state, 2e-3)
         after, points = state.velocities(), state.points()
-        forces = contact.forces.numpy()[: len(speed)]  # with friction
+        forces = contact.terms.forces.numpy()[: len(speed)]  # with friction
         assert np.abs(forces.sum(0)).max() <= 1e-13 * max(np.abs(forces).sum(), 1e-300)
         model.touch.evaluate(state.coupled.q)
         forces = model.touch.terms.forces.numpy()[: len(speed)]  # without

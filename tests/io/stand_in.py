@@ -79,7 +79,7 @@ class Model:
     curves: Curves = field(default_factory=curves)
     surfaces: Surfaces | None = None
     obstacles: object = None
-    touching: object = None
+    contact_scales: object = None
     worlds: int = 1
     scene: object = None
 
