@@ -29,6 +29,7 @@ from ddg_warp.kernels.newton import coupled_newton
 from ddg_warp.model.state import Sliding, State
 from ddg_warp.solve.collision.support_arcs import Arcs
 from ddg_warp.solve.equilibrium.friction_newton import FrictionNewton
+from ddg_warp.solve.equilibrium.support_checks import adrift
 from ddg_warp.solve.forces.loads import StaticLoads
 from ddg_warp.solve.linear.solver_selection import coupled_preconditioner, large_static
 from ddg_warp.solve.newton.coupled_newton import CoupledNewton
@@ -451,12 +452,7 @@ class CoupledEquilibrium:
         displacement = np.where(self.tangent.angle, 0.0, np.abs(q - self._rest))
         farthest = int(np.argmax(displacement))
         if displacement[farthest] > ADRIFT * self._size:
-            raise SolverError(
-                f"no equilibrium at load parameter {load_factor:g}: adrift, {self.tangent.where(farthest)} is carried away, as neither "
-                "supports nor contact support it; fix it, or add an obstacle",
-                state=state,
-                outcome="adrift",
-            )
+            raise adrift(self.tangent.where(farthest), load_factor, state)
 
     def _relax(self, relaxation, state: State, begun: np.ndarray) -> None:
         """Relax the displacement under new normal forces, in worlds whose supports did not move.

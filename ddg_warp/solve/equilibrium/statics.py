@@ -34,7 +34,7 @@ from ddg_warp.solve.equilibrium.newton_direct import DirectNewton
 from ddg_warp.solve.equilibrium.newton_pcg import UNSETTLED, CoupledEquilibrium
 from ddg_warp.solve.equilibrium.residuals import Residuals
 from ddg_warp.solve.equilibrium.rest_path import RestPath
-from ddg_warp.solve.equilibrium.support_checks import require_supports
+from ddg_warp.solve.equilibrium.support_checks import adrift, require_supports, unsupported_dof
 from ddg_warp.solve.equilibrium.tangent import Tangent
 from ddg_warp.solve.forces.prescribed_motion import jump_between, poses_between
 from ddg_warp.solve.linear.solver_selection import large_static, static_solver, why_not_pcg
@@ -443,8 +443,8 @@ class Equilibrium:
             small: islands with residuals below the tolerance, not only below the rounding floor (islands,).
 
         Raises:
-            SolverError: `lost_in_rounding`: supports and obstacles miss a fraction of the full loads (load parameter 1 or beyond) by
-                rounding. Smaller load steps may miss more.
+            SolverError: `adrift`: neither supports nor contact stop a body. `lost_in_rounding`: supports and obstacles miss a fraction
+                of the full loads (load parameter 1 or beyond) by rounding. Smaller load steps may miss more.
         """
         model, unbalanced = self.model, self.residuals.unbalanced(residual, outer)
         rounded = np.bincount(self.tangent.world, ~small, model.worlds) > 0
@@ -453,6 +453,8 @@ class Equilibrium:
             full = np.abs(self.tangent.loads(1.0, self.tangent.dofs(state)))
             lost &= self.residuals.unbalanced(residual, np.maximum(np.abs(outer), full)) > LOST
         if lost.any():
+            if (dof := unsupported_dof(self.tangent, state)) is not None:
+                raise adrift(self.tangent.where(dof), load_factor, state)
             world = int(np.argmax(np.where(lost, unbalanced, 0.0)))
             raise SolverError(
                 f"no equilibrium at load parameter {load_factor:g}: lost_in_rounding, the stiffest elements make forces so uncertain "

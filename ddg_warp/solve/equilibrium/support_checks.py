@@ -1,8 +1,9 @@
 """Support requirements of static solves."""
 
 import numpy as np
+from scipy.sparse import csgraph
 
-from ddg_warp.errors import SceneError
+from ddg_warp.errors import SceneError, SolverError
 
 
 def require_supports(model) -> None:
@@ -32,3 +33,29 @@ def require_supports(model) -> None:
                 f"no node of the shells and joined rods is supported along {'xyz'[loose[0]]}: a static solve needs supports; "
                 "add scene.hold(...), scene.clamp_boundary(...) or scene.fix(...)"
             )
+
+
+def unsupported_dof(tangent, state) -> int | None:
+    """Return a dof of a component without a fixed dof at a state without contact; None with contact or without such a component.
+
+    Components are connected by nonzeros of the Hessian. Loads carry such a component so far that it converges to rounding.
+    """
+    touch = tangent.model.touch
+    if touch is None:
+        return None
+    touch.evaluate(state.coupled.q)
+    if touch.terms.active_pairs.numpy().any():
+        return None
+    _, component = csgraph.connected_components(tangent.hessian(state), directed=False)
+    loose = np.flatnonzero(tangent.free & ~np.isin(component, component[~tangent.free]) & ~tangent.angle)
+    return int(loose[0]) if loose.size else None
+
+
+def adrift(where: str, load_factor: float, state) -> SolverError:
+    """Return the error of a body that loads carry away."""
+    return SolverError(
+        f"no equilibrium at load parameter {load_factor:g}: adrift, {where} is carried away, as neither supports nor contact "
+        "support it; fix it, or add an obstacle",
+        state=state,
+        outcome="adrift",
+    )
