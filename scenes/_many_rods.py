@@ -132,13 +132,13 @@ def jittered(model, seed: int):
     """Return the initial state with free nodes moved randomly by up to a fifth of the activation distance; see `jitter`."""
     tangent, points = Tangent(model), model.state().points()
     free = tangent.at_points(tangent.free.astype(float))
-    return model.state(points=points + 0.2 * model.scene.contact_parameters.range * free * jitter(points.shape, seed))
+    return model.state(points=points + 0.2 * model.scene.contact_settings.range * free * jitter(points.shape, seed))
 
 
 def smallest_gap(model, state) -> float:
     """Return the smallest gap within the activation distance [m], or that distance if there is none."""
     gap = model.contacts(state).gap
-    return float(gap.min()) if len(gap) else float(model.scene.contact_parameters.range)
+    return float(gap.min()) if len(gap) else float(model.scene.contact_settings.range)
 
 
 def tubes(model, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

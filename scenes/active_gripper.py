@@ -122,7 +122,7 @@ def check(result) -> list[ddg.Check]:
 def _checks(result, names) -> list[ddg.Check]:
     series, t = {name: np.array(values) for name, values in result.series.items()}, np.array(result.times)
     slides, still = t > PULLS + 0.6 * (END - PULLS), (t > WINDS + 0.25) & (t <= PULLS)
-    mu = result.model.scene.contact_parameters.friction
+    mu = result.model.scene.contact_settings.friction
     wound = LENGTH / np.hypot(POST + RADIUS, RISE) / (2.0 * np.pi)
     ratio = series["pull"][slides] / (mu * series["pressed"][slides])
     return [

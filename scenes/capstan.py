@@ -106,7 +106,7 @@ def bent(model, points: np.ndarray, seed: int):
     """Return the wound state of the rod; its rest shape is straight."""
     free = np.arange(len(points))[:, None] < len(points) - 1
     return model.state(
-        points=points + 0.2 * model.scene.contact_parameters.range * free * _many_rods.jitter(points.shape, seed)
+        points=points + 0.2 * model.scene.contact_settings.range * free * _many_rods.jitter(points.shape, seed)
     )
 
 
@@ -147,7 +147,7 @@ def check(result) -> list[ddg.Check]:
 
 def _checks(result, names) -> list[ddg.Check]:
     scene = result.model.scene
-    mu, slack = scene.contact_parameters.friction, np.array(scene.loads[0].force)
+    mu, slack = scene.contact_settings.friction, np.array(scene.loads[0].force)
     tension = np.linalg.norm(slack)
     steps = np.diff(scene.batches[0].points[0], axis=0)
     steps /= np.linalg.norm(steps, axis=1)[:, None]

@@ -95,7 +95,7 @@ def observe(model, state) -> dict[str, float]:
     return {
         "drawn": moved[-1],
         "crept": moved[0],
-        "force": pull / (model.scene.contact_parameters.friction * WEIGHT * LENGTH),
+        "force": pull / (model.scene.contact_settings.friction * WEIGHT * LENGTH),
         "gap": _many_rods.smallest_gap(model, state),
     }
 
@@ -114,7 +114,7 @@ def check(result) -> list[ddg.Check]:
 def _checks(result, names) -> list[ddg.Check]:
     times, series = np.array(result.times), {name: np.array(values) for name, values in result.series.items()}
     exact = np.array([expected(u, t > TURN + 1e-9) for t, u in zip(times, series["drawn"], strict=True)])
-    turn, velocity = int(np.argmax(series["drawn"])), result.model.scene.contact_parameters.velocity
+    turn, velocity = int(np.argmax(series["drawn"])), result.model.scene.contact_settings.velocity
     errors, crept = np.abs(series["force"] - exact)[times > LAID + 1e-9], series["crept"][times > LAID - 1e-9]
     n = result.model.curves.counts[0] - 1
     return [

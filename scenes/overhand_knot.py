@@ -153,7 +153,7 @@ def check(result) -> list[ddg.Check]:
 
 
 def _checks(result) -> list[ddg.Check]:
-    friction, times = result.model.scene.contact_parameters.friction, np.array(result.times)
+    friction, times = result.model.scene.contact_settings.friction, np.array(result.times)
     R, traction, normal, h = (np.array(result.series[k]) for k in ("radius", "traction", "normal", "half"))
     n = round(float(np.sqrt(R[0] / RADIUS / LOOSE)))
     epsilon, traction, normal = np.sqrt(h / R), traction * h**2 / B, normal * h**2 / B

@@ -131,7 +131,7 @@ def check(result) -> list[ddg.Check]:
 def _checks(result, scene, names) -> list[ddg.Check]:
     normal = np.array(scene.obstacles[0].shape.normal)
     tangent, cosine = normal[0] / normal[2], normal[2]
-    law, slippery = scene.contact_parameters, scene.betweens[0].friction
+    law, slippery = scene.contact_settings, scene.betweens[0].friction
     speed = np.linalg.norm(scene.initial(result.model).velocities().reshape(-1, 3), axis=-1).max()
     series = {name: np.array(values) for name, values in result.series.items()}
     t, settled = np.array(result.times), np.array(result.times) > SETTLED * result.times[-1]

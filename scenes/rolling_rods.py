@@ -111,7 +111,7 @@ def check(result) -> list[ddg.Check]:
 
 
 def _checks(result, scene) -> list[ddg.Check]:
-    normal, mu = np.array(scene.obstacles[0].shape.normal), scene.contact_parameters.friction
+    normal, mu = np.array(scene.obstacles[0].shape.normal), scene.contact_settings.friction
     speed = np.linalg.norm(scene.initial(result.model).velocities().reshape(-1, 3), axis=-1).max()
     inputs = {"rolls": (mu, 0.0), "bowled": (mu, speed), "slips": (scene.betweens[0].friction, 0.0)}
     exact = [expected(np.arctan2(normal[0], normal[2]), *inputs[name], result.times[-1]) for name in NAMES]

@@ -97,7 +97,7 @@ def observe(model, state) -> dict[str, float]:
 
 def check(result) -> list[ddg.Check]:
     """Check delta of the slip, forces there and before, and creep until then."""
-    mu, law = result.model.scene.contact_parameters.friction, result.model.scene.contact_parameters
+    mu, law = result.model.scene.contact_settings.friction, result.model.scene.contact_settings
     series = {name: np.array(values) for name, values in result.series.items()}
     slips = np.flatnonzero(series["tip_speed"] * LENGTH > law.velocity)
     where, normal = SLIP[mu]
@@ -116,7 +116,7 @@ def check(result) -> list[ddg.Check]:
 def _checks(result, series, slips, reference, names) -> list[ddg.Check]:
     where, normal, sticks = reference
     first = slips[0] if len(slips) else -1
-    mu, law = result.model.scene.contact_parameters.friction, result.model.scene.contact_parameters
+    mu, law = result.model.scene.contact_settings.friction, result.model.scene.contact_settings
     ratio = series["tangential"] / np.maximum(series["normal"], 1e-12)
     previous = max(first - 1, 0)
     # the tangential force reaches its bound within the step before the first slipping one

@@ -146,7 +146,7 @@ def head_motion(points: np.ndarray, sway: float) -> ddg.Motion:
 def observe(model, state) -> dict[str, float]:
     """Return `_strands.observe`, and `_many_rods.observe` with contact."""
     observed = _strands.observe(model, state)
-    return {**_many_rods.observe(model, state), **observed} if model.scene.contact_parameters else observed
+    return {**_many_rods.observe(model, state), **observed} if model.scene.contact_settings else observed
 
 
 def check(result) -> list[ddg.Check]:
@@ -154,7 +154,7 @@ def check(result) -> list[ddg.Check]:
 
     With contact, check also that nothing interpenetrates.
     """
-    if not result.model.scene.contact_parameters:
+    if not result.model.scene.contact_settings:
         return _strands.checks(result, 1e-3, "weight and inertia over EA")
     stopped = _strands.stopped(result) / (result.dt * result.model.scene.batches[0].section.EA)
     checks = _strands.checks(result, stopped, "a strand at top speed that is stopped in a step, over EA")

@@ -158,7 +158,7 @@ def _checks(result, names) -> list[ddg.Check]:
     scene = result.model.scene
     steps = round(PERIOD / result.dt)
     gone = {name: result.series[name][-1] - result.series[name][-1 - steps] for name in NAMES}
-    mu = scene.contact_parameters.friction
+    mu = scene.contact_settings.friction
     carried = np.array(result.series["carried"][-steps:])
     return [
         ddg.Check(names[0], gone[SNAKE], advance(SNAKE, scene.betweens[0].friction), 0.02, BALANCE, True),

@@ -108,7 +108,7 @@ class CoupledStepAdjoint:
         storages = [coupled_storage(part.term, real) for part in coupled.sets]
         self._vjp = [elements.pull_kernel(storage, 0, real, True, True) for storage in storages]
         self._strains = [
-            elements.strain_kernel(storage, 0, real, True) if part.term.density.lagged else None
+            elements.strain_vjp_kernel(storage, 0, real, True) if part.term.density.lagged else None
             for storage, part in zip(storages, coupled.sets, strict=True)
         ]
         self._solution, self._inertia, self._start = time_step.step_kernels(coupled.nodes, real, midpoint, drag)

@@ -98,7 +98,7 @@ class RodStepAdjoint:
         terms = range(len(kind.terms))
         storage, viscous = rod_storage(kind, real), kind.viscous
         self._vjp = [elements.pull_kernel(storage, i, real, False, viscous) for i in terms]
-        self._strain = [elements.strain_kernel(storage, i, real, False) for i in terms] if viscous else []
+        self._strain = [elements.strain_vjp_kernel(storage, i, real, False) for i in terms] if viscous else []
         self._frame = rod_elements.frame_kernel(kind, real, first=not kind.viscous) if kind.twist else None
         self._ends, self._nodes, self._edges = rod_elements.gather_kernels(kind, real)
         self.unread = {"v", "omega", "a", "alpha"} | (set() if kind.viscous else {"frame", "last"})

@@ -41,7 +41,7 @@ class ContactParameters:
 
     Attributes:
         law: contact description of the scene; bodies: collision bodies, obstacles last.
-        density: contact law as a function of the distance; keep: fraction of the thickness that motion preserves.
+        density: contact law as a function of the distance; min_separation_fraction: fraction of the thickness that motion preserves.
         names: names of the groups with common parameters; group (bodies,): index of the group of each body.
         friction, stiffness [N/m], range [m]: parameters of pairs of groups (groups, groups).
         inertia: masses [kg] of pairs of groups (groups, groups). Divided by the step squared, they bound the stiffness of a step that

@@ -67,10 +67,10 @@ class Model:
         self.groups = [
             RodGroup(data, scene, self.worlds, self.wp_device, self.types.real) for data in self.rod_group_data
         ]
-        self.coupled = self._build_net() if needs_coupling(scene) else None
+        self.coupled = self._build_coupled() if needs_coupling(scene) else None
         self.order = UserNumbering(self)
 
-    def _build_net(self):
+    def _build_coupled(self):
         from ddg_warp.compile.coupled.builder import compile_coupled
         from ddg_warp.model.coupled_model import CoupledModel
 
@@ -481,7 +481,7 @@ def needs_coupling(scene) -> bool:
         scene.attachments,
         scene.magnets,
         scene.axisymmetric_shells,
-        scene.contact_parameters,
+        scene.contact_settings,
     )
     return any(map(bool, parts))
 

@@ -106,9 +106,9 @@ def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, ang
     ):
         count = 0 if model.coupled is None else len(model.coupled.host.shells)
         raise ValueError(f"shell {shell} does not exist; the model has {count} shells")
-    net_shell, bending = model.coupled.host.shells[shell], model.scene.shells[shell].bending
+    coupled_shell, bending = model.coupled.host.shells[shell], model.scene.shells[shell].bending
     membrane = model.scene.shells[shell].membrane
-    surface, changes = net_shell.surface, dict(plate or {})
+    surface, changes = coupled_shell.surface, dict(plate or {})
     count = len(surface.triangles)
     if not changes and all(values is None for values in (points, metric, curvature, angle)):
         raise ValueError("set_rest: give points, metric, curvature or angle")
@@ -118,8 +118,8 @@ def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, ang
         points = _shaped("points", points, surface.points.shape)
         _refuse_without_area("points", fundamental_forms.metric(surface, points))
         changes["abar"] = fundamental_forms.metric(surface, points)
-        changes["bbar"] = fundamental_forms.second_form(surface, points, net_shell.kinds)
-        changes["angle"] = fundamental_forms.edge_angles(surface, points, net_shell.kinds)
+        changes["bbar"] = fundamental_forms.second_form(surface, points, coupled_shell.kinds)
+        changes["angle"] = fundamental_forms.edge_angles(surface, points, coupled_shell.kinds)
     if metric is not None:
         changes["abar"] = _shaped("metric", metric, (count, 3))
         _refuse_without_area("metric", changes["abar"])
@@ -132,11 +132,11 @@ def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, ang
             raise ValueError(f"bending {bending!r} has no rest angles; give a curvature, or the points of a rest shape")
         angle = _shaped("angle", angle, (len(surface.edges),))
         changes["angle"] = np.repeat(angle[:, None], 2, axis=1)
-    plate = replace(net_shell.plate, **changes)
+    plate = replace(coupled_shell.plate, **changes)
     sets = {part.term.law: part for part in model.coupled.sets}
-    elements_of = shells.shell_elements(surface, plate, net_shell.kinds, bending, membrane)
-    places = [(sets[e.term.law], net_shell.first[e.term.name], e.parameters) for e in elements_of if len(e)]
-    net_shell.plate = plate  # nothing can fail after this
+    elements_of = shells.shell_elements(surface, plate, coupled_shell.kinds, bending, membrane)
+    places = [(sets[e.term.law], coupled_shell.first[e.term.name], e.parameters) for e in elements_of if len(e)]
+    coupled_shell.plate = plate  # nothing can fail after this
     model.note_change(any([part.set_rest(first, parameters) for part, first, parameters in places]))
 
 

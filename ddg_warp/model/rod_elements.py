@@ -27,10 +27,12 @@ class RodElements:
         self._elements = {span: _padded(elements, nodes) for span, elements in self.lists.items()}
 
     def parameters(self, but: dict | None = None) -> dict[str, np.ndarray]:
-        """Return values by "term.parameter", each broadcastable to (nodes, W R).
+        """Return values by "term.parameter" for W worlds and R rods, each broadcastable to (nodes, W R).
+
+        Decoupled steps copy changed ones into their rod groups; the solver selection estimates stiffnesses from all.
 
         Args:
-            but: arrays by "term.parameter" that are left out if unchanged; updated to the current ones.
+            but: arrays by "term.parameter" that are left out if they are the same objects; updated to the current ones.
         """
         result, worlds = {}, self.coupled.worlds
         for term in self._terms:

@@ -66,7 +66,7 @@ class UserNumbering:
         return Obstacles.of(scene.obstacles, np.concatenate(points))
 
     @cached_property
-    def net_rows(self) -> tuple[np.ndarray, np.ndarray]:
+    def coupled_rows(self) -> tuple[np.ndarray, np.ndarray]:
         """Rows of `State.points` from the coupled system, and the dof blocks that fill them."""
         if self.model.coupled is None:
             return np.zeros(0, int), np.zeros(0, int)
@@ -166,7 +166,7 @@ class UserNumbering:
         """Return `blocks` (worlds N, 3) with values in user order (P, 3) filled in."""
         values = self._points(values, label)
         out = blocks.astype(float).reshape(self.model.worlds, -1, 3)
-        rows, indices = self.net_rows
+        rows, indices = self.coupled_rows
         out[:, indices] = (values if values.ndim == 3 else values[None])[:, rows]
         return out.reshape(-1, 3)
 
@@ -197,7 +197,7 @@ class UserNumbering:
         """Return nodal values in user order from group arrays (node, column, dim) and dof blocks (worlds N, 3)."""
         out = np.zeros((self.model.worlds, self.points_count, 3))
         if blocks is not None:
-            rows, indices = self.net_rows
+            rows, indices = self.coupled_rows
             out[:, rows] = np.asarray(blocks.numpy() if isinstance(blocks, wp.array) else blocks).reshape(
                 self.model.worlds, -1, 3
             )[:, indices]

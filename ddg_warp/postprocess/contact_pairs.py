@@ -26,7 +26,7 @@ def contacts(model, state) -> Contacts:
     for size, owner in owners.items():
         for side in range(2):
             of_size = pairs["sizes"][:, side] == size
-            objects[of_size, side] = owner[pairs["things"][of_size, side]]
+            objects[of_size, side] = owner[pairs["primitives"][of_size, side]]
     active = np.flatnonzero(pairs["force"].any(1))
     return Contacts(
         pairs["world"][active],

@@ -141,7 +141,7 @@ def drag(model, state) -> Drag:
             inertia, u = resisted.at(state.coupled, state.time)
             force = np.einsum("wkij,wkj->wki", inertia["resistance"], u - v)
         power += (force * v).sum((1, 2))
-        _, places = model.order.net_rows
+        _, places = model.order.coupled_rows
         turns = force[:, model.coupled.angle_start :, 0]
         blocks = force / np.maximum(1, np.bincount(places, minlength=force.shape[1]))[:, None]
     force, moment = model.order.nodes(forces, blocks), model.order.edges(moments, turns)

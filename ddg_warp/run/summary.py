@@ -44,7 +44,7 @@ def summary(scene: str, parameters: Mapping, result, checks: Iterable) -> dict:
         "checks": [check.as_dict() for check in checks],
     }
     if "contact" in statistics:
-        content["contact"] = {"law": result.scene.contact_parameters.name, **statistics["contact"]}
+        content["contact"] = {"law": result.scene.contact_settings.name, **statistics["contact"]}
     if result.counted_from is not None:
         content["counted_from"] = result.counted_from
     if result.dt is None:

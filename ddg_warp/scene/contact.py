@@ -60,7 +60,7 @@ class Between:
 class Contacts:
     """Contact and obstacles of a scene."""
 
-    contact_parameters: Contact | None = field(default=None, init=False)
+    contact_settings: Contact | None = field(default=None, init=False)
     betweens: list[Between] = field(default_factory=list, init=False)
     obstacles: list[Obstacle] = field(default_factory=list, init=False)
 
@@ -115,7 +115,7 @@ class Contacts:
         Raises:
             SceneError: an invalid argument, or a second call.
         """
-        if self.contact_parameters is not None:
+        if self.contact_settings is not None:
             raise SceneError("contact: this scene has contact already; use contact_between for exceptions")
         call = "contact: "
         range = None if range is None else argument_checks.positive(f"{call}range", range, "m")
@@ -131,7 +131,7 @@ class Contacts:
         for name, value in (radius or {}).items():
             argument_checks.text(f"{call}a name in radius", name)
             argument_checks.positive(f"{call}radius of {name!r}", value, "m")
-        self.contact_parameters = Contact(
+        self.contact_settings = Contact(
             law if is_law(law) else argument_checks.choice(f"{call}law", law, LAWS),
             range,
             stiffness,
@@ -232,7 +232,7 @@ def check_contact(scene) -> None:
     Raises:
         SceneError: the first error.
     """
-    if scene.contact_parameters is None:
+    if scene.contact_settings is None:
         if scene.obstacles:
             raise SceneError(f"obstacle 0 ('{scene.obstacles[0].name}') has no contact; add scene.contact()")
         if scene.betweens:
@@ -242,17 +242,17 @@ def check_contact(scene) -> None:
         raise SceneError("contact: a scene with contact has dimension 3; leave dimension=2 to scenes without")
     if scene.axisymmetric_shells:
         raise SceneError(f"contact: shell of revolution 0 ('{scene.axisymmetric_shells[0].name}') has no contact")
-    if not any(np.any(between.friction) for between in (scene.contact_parameters, *scene.betweens) if between.friction):
+    if not any(np.any(between.friction) for between in (scene.contact_settings, *scene.betweens) if between.friction):
         for name in ("friction_law", "velocity", "friction_iterations"):
-            if getattr(scene.contact_parameters, name) != getattr(Contact, name):
+            if getattr(scene.contact_settings, name) != getattr(Contact, name):
                 raise SceneError(
                     f"contact: {name} is of friction, and there is none; give friction, or leave {name} out"
                 )
     bodies = {batch.name for batch in scene.batches} | {shell.name for shell in scene.shells}
     moving, obstacles = contact_names(scene), {obstacle.name for obstacle in scene.obstacles}
     names = moving | obstacles
-    named = [("objects", name, bodies) for name in scene.contact_parameters.objects or ()]
-    named += [("radius", name, moving) for name in scene.contact_parameters.radius]
+    named = [("objects", name, bodies) for name in scene.contact_settings.objects or ()]
+    named += [("radius", name, moving) for name in scene.contact_settings.radius]
     named += [("contact_between", name, names) for between in scene.betweens for name in between.names]
     for label, name, valid in named:
         if name not in valid:
@@ -284,10 +284,10 @@ def _check_directed(scene, between: Between, obstacles: set[str]) -> None:
 
 def contact_names(scene) -> set[str]:
     """Return the names of rods and shells with contact."""
-    if scene.contact_parameters is None:
+    if scene.contact_settings is None:
         return set()
-    if scene.contact_parameters.objects is not None:
-        return set(scene.contact_parameters.objects)
+    if scene.contact_settings.objects is not None:
+        return set(scene.contact_settings.objects)
     return {batch.name for batch in scene.batches} | {shell.name for shell in scene.shells}
 
 

@@ -117,9 +117,9 @@ class StepControls:
                 return result + by_gravity * flags[-1][:, None]
             w = view(gradients.load).reshape(worlds, -1, 3) * flags[-1][:, None, None]
             if name == "forces":
-                rows, blocks = self.layout.places(("points", "net"), lambda: model.order.net_rows)
+                rows, blocks = self.layout.places(("points", "net"), lambda: model.order.coupled_rows)
                 result[:, rows] = w[:, blocks]
             else:
-                rows, blocks = self.layout.net_edges()
+                rows, blocks = self.layout.coupled_edges()
                 result[:, rows] = w[:, blocks, 0]
         return result

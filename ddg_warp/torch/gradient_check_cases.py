@@ -108,7 +108,7 @@ class Case:
         """Return random velocities (worlds, P, 3), within the planes of skew supports."""
         rates = 0.3 * self._normal(WORLDS, self.model.points_count, 3) * self.axes
         frames = self.model.coupled.host.frames if self.model.coupled is not None else {}
-        for row, block in zip(*self.model.order.net_rows, strict=True) if frames else ():
+        for row, block in zip(*self.model.order.coupled_rows, strict=True) if frames else ():
             if block in frames:
                 normals = self._tensor(frames[block][self.model.coupled.host.fixed[block]])
                 rates[:, row] -= rates[:, row] @ normals.T @ normals

@@ -139,7 +139,7 @@ def _masses(model, name: str) -> Iterator[_Part]:
             group,
         )
     if model.coupled is not None:
-        coupled, (rows, blocks) = model.coupled, order.net_rows
+        coupled, (rows, blocks) = model.coupled, order.coupled_rows
         chosen = np.isin(rows, np.arange(order.points_count)[_rows(model, name)])
         rows, blocks = rows[chosen], blocks[chosen]
         nodes, shape = coupled.host.nodes, (coupled.worlds, coupled.blocks, 3)

@@ -204,7 +204,7 @@ class Simulator(torch.nn.Module):
 
         argument_checks.count("steps", steps)
         first = given(0)
-        every = self._plan(state, first, steps, save, checkpoint_every, memory, callable(controls)).every
+        every = self._checkpoint_plan(state, first, steps, save, checkpoint_every, memory, callable(controls)).every
         full, version = self._full(engine, parameters), self.model.version
 
         def step(state: WorldState, full: list, controls: dict) -> WorldState:
@@ -228,9 +228,13 @@ class Simulator(torch.nn.Module):
         """
         several = callable(controls)
         first = self._controls(self._own(state), controls(0) if several else controls)
-        return self._plan(state, first, argument_checks.count("steps", steps), save, checkpoint_every, memory, several)
+        return self._checkpoint_plan(
+            state, first, argument_checks.count("steps", steps), save, checkpoint_every, memory, several
+        )
 
-    def _plan(self, state: WorldState, controls: dict, steps: int, save: int, every, memory, several: bool) -> Plan:
+    def _checkpoint_plan(
+        self, state: WorldState, controls: dict, steps: int, save: int, every, memory, several: bool
+    ) -> Plan:
         """Return the plan; `several` is True if each step has controls of its own, which are all kept."""
         if argument_checks.count("save", save) > steps:
             raise SceneError(f"rollout: save = {save} of {steps} steps returns no state; give {steps} at most")

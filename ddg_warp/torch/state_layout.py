@@ -112,7 +112,7 @@ class StateLayout:
             target = k[None], torch.arange(worlds, device=k.device)[:, None], column[None]
             values[index] = old.index_put(target, new).reshape(values[index].shape)
         if model.coupled is not None:
-            rows, blocks_of = self.places(("given", "net"), lambda: _last(*model.order.net_rows))
+            rows, blocks_of = self.places(("given", "net"), lambda: _last(*model.order.coupled_rows))
             index = self._of(f"net/{blocks}")
             old = values[index].reshape(worlds, -1, 3)
             target = torch.arange(worlds, device=rows.device)[:, None], blocks_of[None]
@@ -131,7 +131,7 @@ class StateLayout:
                 increment = increment.index_put((k[:, None], world[None], column[:, None]), more[:, rows].T)
                 values[index] = values[index] + increment.reshape(values[index].shape)
         if model.coupled is not None:
-            index, (rows, owned) = self._of(f"net/{blocks}"), self.net_edges()
+            index, (rows, owned) = self._of(f"net/{blocks}"), self.coupled_edges()
             increment = torch.zeros_like(values[index]).reshape(worlds, -1, 3)
             increment = increment.index_put((world[:, None], owned[None], torch.zeros_like(owned)[None]), more[:, rows])
             values[index] = values[index] + increment.reshape(values[index].shape)
@@ -151,7 +151,7 @@ class StateLayout:
         """Return 1 for worlds with a gradient in every island, else NaN."""
         return torch.stack([flag.reshape(self.model.worlds, -1).sum(1) * 0.0 + 1.0 for flag in flags]).prod(0)
 
-    def net_edges(self) -> list[torch.Tensor]:
+    def coupled_edges(self) -> list[torch.Tensor]:
         """Return rows among all edges, and dof blocks, of the edges of coupled rods."""
         return self.places(("edges", "net"), lambda: _coupled_edges(self.model))
 
@@ -179,7 +179,7 @@ class StateLayout:
             k, column, points = model.order.places(group)
             rows[:, points] = offset + k * group.columns + world * group.rods + column
         if model.coupled is not None:
-            points, blocks = model.order.net_rows
+            points, blocks = model.order.coupled_rows
             rows[:, points] = first[len(model.groups)] + world * model.coupled.blocks + blocks
         return rows.ravel()
 

@@ -54,7 +54,7 @@ def pull_kernel(storage: ElementStorage, index: int, real, adds: bool, measured:
 
     Args:
         adds: True to add all of these.
-        measured: True to add the derivatives by the rest measure, where `strain_kernel` has written some.
+        measured: True to add the derivatives by the rest measure, where `strain_vjp_kernel` has written some.
     """
     access, Inputs = storage.terms[index], storage.Inputs
     term, density, local, short, spread = access.term, access.term.density, access.local, access.short, access.spread
@@ -111,8 +111,10 @@ def pull_kernel(storage: ElementStorage, index: int, real, adds: bool, measured:
 
 
 @cache
-def strain_kernel(storage: ElementStorage, index: int, real, adds: bool):
+def strain_vjp_kernel(storage: ElementStorage, index: int, real, adds: bool):
     """Build the reverse of the strains of a term: derivatives by window, lagged and constant data, and rest measure.
+
+    Strains at the end of a step are the reference of the next one in viscous terms; launch before `vjp` of the elements.
 
     `vjp`: write them, or add them with `adds`, from the derivatives by strains.
     """

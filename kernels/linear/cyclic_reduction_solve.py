@@ -204,7 +204,7 @@ def solve_at_path_nodes_kernel(twist: bool, linear):
         count: wp.array(dtype=int),
         idle: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
-        net_blocks: int,
+        coupled_blocks: int,
         blocks: int,
         threads: int,
         rhs: wp.array3d(dtype=linear),
@@ -220,7 +220,7 @@ def solve_at_path_nodes_kernel(twist: bool, linear):
         if wanted[w] != 1 or idle[r] != 0:
             return
         n = count[c]
-        first = w * net_blocks
+        first = w * coupled_blocks
         for k in range(t, 2 * blocks, threads):
             j = k / 2
             row = (k - 2 * j) * wp.static(nb)

@@ -42,8 +42,9 @@ def coupling_functions(linear):
 def joint_kernels(linear):
     """Build the kernels of joints.
 
-    `measure`: compute S_jj of every joint and the inverse.
-    `meet`: compute z_J.
+    `factorise_joints`: write P, Q and R of every joint, from responses `values` to unit probes; H_jj serves where S_jj is
+    indefinite, which counts in `lost`.
+    `solve_joints`: compute z_J.
 
     A joint has one dof block or two (a node and the rotation of its rigid joint), a and b, rows 2 m and 2 m + 1 of all joints. With P
     = S_aa^-1, Q = P S_ab and R = (S_bb - S_ba Q)^-1 the solution is z_b = R (t_b - Q^T t_a), z_a = P t_a - Q z_b.
@@ -97,7 +98,7 @@ def joint_kernels(linear):
         return y
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def measure(
+    def factorise_joints(
         matrix: wp.array2d(dtype=linear),
         columns: wp.array(dtype=int),
         starts: wp.array(dtype=int),
@@ -172,7 +173,7 @@ def joint_kernels(linear):
         parts_out[2, i] = R
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def meet(
+    def solve_joints(
         matrix: wp.array2d(dtype=linear),
         columns: wp.array(dtype=int),
         starts: wp.array(dtype=int),
@@ -213,4 +214,4 @@ def joint_kernels(linear):
         moved_out[2 * i] = parts[0, i] * t - parts[1, i] * z
         moved_out[2 * i + 1] = z
 
-    return measure, meet
+    return factorise_joints, solve_joints

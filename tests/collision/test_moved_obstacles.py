@@ -114,7 +114,7 @@ def test_rotating_surfaces_accelerate_a_rod_by_friction(device, shape, drive):
         np.diff(speeds)[sliding].sum() / dt, mu * np.sum(normal_forces[sliding]) / mass, rtol=0.03
     )
     np.testing.assert_allclose(np.sum(couples[sliding]), mu * radius * np.sum(normal_forces[sliding]), rtol=0.03)
-    assert abs(speeds[-1] - speed) < model.scene.contact_parameters.velocity
+    assert abs(speeds[-1] - speed) < model.scene.contact_settings.velocity
     assert abs(couples[-1]) < 0.05 * mu * radius * normal_forces[-1]
 
 

@@ -21,7 +21,7 @@ INERTIA = 10.0  # least contact stiffness after a step ended at the minimum gap,
 
 def contact_parameters(scene, coupled: CoupledSystem) -> ContactParameters | None:
     """Return the contact of the coupled system, None without."""
-    law = scene.contact_parameters
+    law = scene.contact_settings
     if law is None:
         return None
     names, bodies, forces, sections = contact_names(scene), [], [], {}

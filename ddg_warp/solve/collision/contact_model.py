@@ -136,7 +136,7 @@ class ContactModel:
         return {
             "world": i // pairs.first.count,
             "sizes": np.broadcast_to([pairs.first.size, pairs.second.size], (count, 2)),
-            "things": np.column_stack([i % pairs.first.count, j % pairs.second.count]),
+            "primitives": np.column_stack([i % pairs.first.count, j % pairs.second.count]),
             "gap": gap.numpy(),
             "point": point.numpy().reshape(-1, 3),
             "force": force,
@@ -156,7 +156,8 @@ class ContactModel:
             return np.inf, "", ()
         k = int(np.argmin(np.where(np.isfinite(candidates["gap"]), candidates["gap"], np.inf)))
         primitives = [
-            tuple(map(int, numbers)) for numbers in zip(candidates["sizes"][k], candidates["things"][k], strict=True)
+            tuple(map(int, numbers))
+            for numbers in zip(candidates["sizes"][k], candidates["primitives"][k], strict=True)
         ]
         first, second = (self.shapes.describe(*primitive) for primitive in primitives)
         world = f" in world {candidates['world'][k]}" if self.coupled.worlds > 1 else ""

@@ -274,7 +274,7 @@ class CoupledTangent(TangentBlock):
 
     def point_dofs(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the rows of `State.points`, and the dofs (rows, 3) of the first world."""
-        rows, blocks = self.model.order.net_rows
+        rows, blocks = self.model.order.coupled_rows
         return rows, self.host.dofs(blocks)
 
     def bodies(self) -> list[Body]:

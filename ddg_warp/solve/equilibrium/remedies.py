@@ -10,7 +10,7 @@ LIMP = 1e-3  # bending stiffness over load times length squared below which it o
 IN_TIME = "step the scene in time (Integrator, with mass_damping) and begin from where it comes to rest"
 
 
-def of_search(equilibrium, error, before, load_factor: float) -> str:
+def search_remedies(equilibrium, error, before, load_factor: float) -> str:
     """Return remedies for a failed search at a load parameter from a state `before`.
 
     `equilibrium` is the `Equilibrium` of the search.

@@ -294,7 +294,7 @@ class Equilibrium:
             "non_finite",
             UNSETTLED,
         )  # messages of other outcomes have a remedy
-        remedy = remedies.of_search(self, error, before, load_factor) if error.outcome in helps else ""
+        remedy = remedies.search_remedies(self, error, before, load_factor) if error.outcome in helps else ""
         return SolverError(f"{error}{details}{remedy and '; ' + remedy}", state=before, outcome=error.outcome)
 
     def _balanced(self, state: State, load_factor: float) -> bool:

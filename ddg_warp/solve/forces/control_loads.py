@@ -201,7 +201,7 @@ def loaded_rows(model, part) -> tuple[np.ndarray, np.ndarray]:
     """Return loadable dof blocks, and the user's row of each: points for nodes, edges for angles."""
     order, host = model.order, part.host
     if part is model.coupled:
-        rows, blocks = order.net_rows
+        rows, blocks = order.coupled_rows
         edges = [order.edge_starts[rod.rod] + np.arange(len(rod.edges)) for rod in host.rods]
         return np.concatenate([blocks, *(rod.edges for rod in host.rods)]), np.concatenate([rows, *edges])
     k, column, rows = order.places(part)

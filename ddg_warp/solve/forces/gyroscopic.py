@@ -35,22 +35,22 @@ class Gyroscope:
         """Kernels to load before a capture."""
         return [part.kernel for part in (*self._parts, self._coupled) if part]
 
-    def begin(self, before: State, steps: list, net_step) -> State:
+    def begin(self, before: State, steps: list, coupled_step) -> State:
         """Return the state before a step with velocities after half of the couples; capturable."""
         groups = [
             part.begin(state, step.islands) if part else state
             for part, state, step in zip(self._parts, before.groups, steps, strict=True)
         ]
-        coupled = self._coupled.begin(before.coupled, net_step.islands) if self._coupled else before.coupled
+        coupled = self._coupled.begin(before.coupled, coupled_step.islands) if self._coupled else before.coupled
         return State(self._model, groups, coupled, before.time, before.grips)
 
-    def finish(self, after: State, steps: list, net_step) -> None:
+    def finish(self, after: State, steps: list, coupled_step) -> None:
         """Apply the other half of the couples to the state after a step, in place; capturable."""
         for part, state, step in zip(self._parts, after.groups, steps, strict=True):
             if part:
                 part.kick(state, state.v, step.islands, True)
         if self._coupled:
-            self._coupled.kick(after.coupled, after.coupled.v, net_step.islands, True)
+            self._coupled.kick(after.coupled, after.coupled.v, coupled_step.islands, True)
 
 
 class _Part:
@@ -70,8 +70,8 @@ class _Part:
         free = np.where(host.holding(np.arange(host.nodes)), 0.0, 1.0)
         free[list(getattr(host, "frames", ()))] = 0.0  # nodes on skew supports count as fixed
         self._free = wp.array(free, dtype=vector, device=device)
-        self._is_net = part is model.coupled
-        shape = (part.worlds * part.blocks,) if self._is_net else (part.nodes, part.columns)
+        self._is_coupled = part is model.coupled
+        shape = (part.worlds * part.blocks,) if self._is_coupled else (part.nodes, part.columns)
         self._v = device_arrays.allocate(shape, vector, device)
 
     def begin(self, state, islands):
@@ -83,7 +83,7 @@ class _Part:
     def kick(self, state, v: wp.array, islands, after: bool) -> None:
         """Apply half of the couples to velocities v."""
         part = self._part
-        if self._is_net:
+        if self._is_coupled:
             x, rates, v, rotary = part.points(state.q), part.angles(state.v), part.points(v), part.node_mass
         else:
             x, rates, rotary = state.x, state.omega, part.rotary

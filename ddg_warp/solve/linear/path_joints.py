@@ -35,14 +35,14 @@ class PathJoints:
         self._factors = wp.zeros((3, max(1, worlds * self.count)), dtype=M, device=device)
         self._responses = paths.allocate(plan.block, linear, len(plan.units))
         self._load, self._follow, self._finish = kernels
-        self._measure, self._meet = joint_schur.joint_kernels(linear) if self.count else (None, None)
+        self._factorise, self._solve = joint_schur.joint_kernels(linear) if self.count else (None, None)
 
     def kernels(self, walks: bool, alone: bool) -> list:
         """Kernels to load before a capture, given whether a fused kernel walks and the elimination applies `alone`."""
         result = [self._load] if not alone and (self.linked or not walks) else []
         result += [self._finish] if not alone and (self.count or not walks) else []
         result += [self._follow] if self._met is not None else []
-        return result + ([self._measure, self._meet] if self.count else [])
+        return result + ([self._factorise, self._solve] if self.count else [])
 
     def prepare(self, system, elimination, blocks: wp.array, lost: wp.array) -> None:
         """Factorise the joints of worlds with a new H, after a `PathElimination` of blocks."""
@@ -51,7 +51,7 @@ class PathJoints:
             elimination.solve(blocks, self._responses, system.outdated, lost)
         inputs = [system.matrix, *self._inputs(self._responses), self._own, self._colour, self._size]
         inputs += [system.masks.fixed, system.outdated, self.sparsity.positions]
-        self._launch(self._measure, self.coupled.worlds * self.count, inputs, [self._factors, lost])
+        self._launch(self._factorise, self.coupled.worlds * self.count, inputs, [self._factors, lost])
 
     def eliminate(self, system, elimination, blocks: wp.array, residual: wp.array, lost: wp.array) -> None:
         """Write the solutions of paths without joint motion, H_II^-1 r_I."""
@@ -64,7 +64,7 @@ class PathJoints:
         if self.count:
             inputs = [system.matrix, *self._inputs(values), self._factors, residual, wanted]
             inputs += [coupled.blocks, self.sparsity.positions]
-            self._launch(self._meet, coupled.worlds * self.count, inputs, [self._moved])
+            self._launch(self._solve, coupled.worlds * self.count, inputs, [self._moved])
         if self._met is not None:
             inputs = [self._met, paths.count, wanted, self._responses, self._moved, self._rows]
             self._launch(self._follow, (paths.longest, paths.columns), inputs, [values])

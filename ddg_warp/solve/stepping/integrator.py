@@ -57,7 +57,7 @@ class Integrator:
             energy of linear oscillations).
         solver: "newton", or "projective": modified Newton, with the Hessian of the first iterate throughout a step.
         linear: linear solver. Rod groups take `"sweep"` (block LDL^T, with a Schur complement for closed rods) or, without closed
-            rods, `"cyclic_reduction"` (block cyclic reduction). The coupled system takes PCG with `"block_jacobi"`, `"rod_step"`
+            rods, `"cyclic_reduction"` (block cyclic reduction). The coupled system takes PCG with `"block_jacobi"`, `"substructuring"`
             (substructuring), `"multilevel"` (fewer, longer iterations for large sheets) or `"substructuring_multilevel"` (both);
             rod groups next to it then take `"auto"`. For rod groups `"auto"` takes the sweep, or cyclic reduction for few long rods
             on CUDA. For the coupled system it decides by the number of nodes between joints and of other nodes. It also steps rods
@@ -114,7 +114,7 @@ class Integrator:
             argument_checks.count("check_every", check_every)
         self.model, self.scheme, self.solver, self.linear = model, scheme, solver, linear
         self.options = argument_checks.options("Integrator", NewtonOptions, options, argument_checks.names(Integrator))
-        if self.options.unconverged_fraction and not model.scene.contact_parameters:
+        if self.options.unconverged_fraction and not model.scene.contact_settings:
             raise SceneError(
                 f"unconverged_fraction = {self.options.unconverged_fraction!r} is for scenes with contact; "
                 "this one has none"

@@ -75,9 +75,10 @@ def by_rate_function(real):
 
 @cache
 def read_functions(kind: Kind, real):
-    """Return the device functions that read the data of a pair: `parameters_of` and `corners`.
+    """Return the device functions that read the data of a pair: `pair_parameters` and `corners`.
 
-    - `parameters_of(law, sides, pair) -> (p, threshold, inner)`: parameters of a pair over all worlds.
+    - `pair_parameters(law, sides, pair) -> (p, threshold, inner)`: parameters of the contact law of a pair, threshold of
+      the mollifier of edges (else 1), and `inner` of the four nodes, see `kernels.collision.contact.potential`.
     - `corners(x, nodes)`: positions (4, 3).
     """
     Law, Sides = law_struct(real), sides_struct(real)
@@ -87,7 +88,7 @@ def read_functions(kind: Kind, real):
     groups = groups_function(real)
 
     @wp.func
-    def parameters_of(law: Law, sides: Sides, pair: wp.vec2i):
+    def pair_parameters(law: Law, sides: Sides, pair: wp.vec2i):
         w, i, j, a, b = groups(law, sides, pair)
         both = law.thickness[w, a, b]
         if both < real(0.0):
@@ -105,7 +106,7 @@ def read_functions(kind: Kind, real):
     def corners(x: wp.array(dtype=V), nodes: wp.vec4i):
         return wp.matrix_from_rows(x[nodes[0]], x[nodes[1]], x[nodes[2]], x[nodes[3]])
 
-    return parameters_of, corners
+    return pair_parameters, corners
 
 
 @cache
@@ -121,7 +122,7 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
     near = distance_function(kind, real)
     about, row_of, *_ = pair_energy_functions(kind, density, real)
     bends = bend_function(kind, density, real)
-    parameters_of, corners = read_functions(kind, real)
+    pair_parameters, corners = read_functions(kind, real)
     (slots, *_), primitives, rows = pair_functions(kind, real), primitives_function(real), rows_of(kind)
 
     @wp.func
@@ -150,7 +151,7 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
         packed = int(0)
         for k in range(wp.tid(), count[0], threads):
             pair = pairs[k]
-            p, _threshold, _inner = parameters_of(law, sides, pair)
+            p, _threshold, _inner = pair_parameters(law, sides, pair)
             nodes = nodes_of(sides, pair)
             _w, d, _n = near(corners(x, nodes))
             world = pair[0] / sides.counts[0]
@@ -220,7 +221,7 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
     ):
         """Write energy, gradient by local node index and factor of each pair."""
         for pair in range(wp.tid(), count[0], threads):
-            p, threshold, inner = parameters_of(law, sides, pairs[pair])
+            p, threshold, inner = pair_parameters(law, sides, pairs[pair])
             points = corners(x, factor.nodes[pair])
             w, d, n = near(points)
             e, g, m = about(points, w, d, n, p, threshold, inner)
@@ -251,7 +252,7 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, unbent: boo
     V, L = wp.types.vector(3, real), wp.types.vector(3, linear)
     W, (place, _) = wp.types.vector(PLACED, linear), place_functions(linear)
     *_, along = pair_energy_functions(kind, density, real)
-    parameters_of, corners = read_functions(kind, real)
+    pair_parameters, corners = read_functions(kind, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def product(
@@ -271,7 +272,7 @@ def exact_product_kernel(kind: Kind, density: Density, real, linear, unbent: boo
             if wp.static(unbent):
                 asked = factor.bend[pair] == linear(0.0)
             if asked:
-                p, threshold, inner = parameters_of(law, sides, pairs[pair])
+                p, threshold, inner = pair_parameters(law, sides, pairs[pair])
                 nodes = factor.nodes[pair]
                 move = X()
                 for slot in range(wp.static(PAIR_NODES)):
@@ -292,7 +293,7 @@ def columns_kernel(kind: Kind, density: Density, real, linear):
     X, *_ = node_types(real)
     V, L = wp.types.vector(3, real), wp.types.vector(3, linear)
     *_, along = pair_energy_functions(kind, density, real)
-    parameters_of, corners = read_functions(kind, real)
+    pair_parameters, corners = read_functions(kind, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def differentiate(
@@ -310,7 +311,7 @@ def columns_kernel(kind: Kind, density: Density, real, linear):
             m = i / 12
             column = i - 12 * m
             pair = chosen[m]
-            p, threshold, inner = parameters_of(law, sides, pairs[pair])
+            p, threshold, inner = pair_parameters(law, sides, pairs[pair])
             move = X()
             move[column / 3, column % 3] = real(1.0)
             dx, _dv, _dp, _dt, _ds = wp.grad(along)(corners(x, factor.nodes[pair]), move, p, threshold, inner)
