@@ -85,21 +85,15 @@ def download(array: wp.array) -> np.ndarray:
 def load_kernels(kernels, device) -> None:
     """Compile and load kernels for launch; a kernel with a block size of its own comes as (kernel, threads).
 
-    Warp compiles a kernel for each block size; on the CPU the block size is one. For the CPU the kernels of a list are compiled
-    together on all cores, since clang runs without the lock of the interpreter.
+    Warp compiles a kernel for each block size; on the CPU the block size is one.
 
-    Measured: compiling for CUDA from several threads did not end within 440 s, where one thread took 115 s.
+    Alternative: compiling in several threads. On two CPU cores it was no faster (49 s for the reverse of steps from an empty cache,
+    and 7 % more CPU time), and for CUDA it hung.
     """
-    cuda, wanted = wp.get_device(device).is_cuda, {}
+    cuda = wp.get_device(device).is_cuda
     for entry in kernels:
         kernel, threads = entry if isinstance(entry, tuple) else (entry, THREADS)
-        wanted[kernel.module, threads if cuda else 1] = None
-    if cuda:
-        for module, threads in wanted:
-            module.load(device, block_dim=threads)
-        return
-    for load in [host_arrays.threads().submit(module.load, device, block_dim=1) for module, _ in wanted]:
-        load.result()
+        kernel.module.load(device, block_dim=threads if cuda else 1)
 
 
 def serial(device) -> bool:
