@@ -279,6 +279,8 @@ def say(result, content: dict, checks: list, directory: Path) -> None:
             f"counts and times are of the steps after {content['counted_from']:g} s: the resumed file stores neither earlier counts "
             "nor the energy at the start"
         )
+    if result.choice is not None:
+        print(result.choice.line())
     if "contact" in content:
         print(contact_line(content["contact"]))
     if "stable" in content:

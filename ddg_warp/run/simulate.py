@@ -41,11 +41,13 @@ class Result:
         dt: Time step [s]; None in statics.
         step_times: Time of each step since the start or resumption [s], by the clock of the run; the first includes compilation.
         wall_time: Time from the scene to the end [s].
-        compile_time: Time from the scene to the end of the first step, less a steady step [s].
+        compile_time: Time from the scene to the end of the first step, less a steady step [s]; includes pilot runs.
         counted_from: Time [s] from which statistics and times count, if the run was resumed from a file without counters.
         failure: Reason of an early end, or "".
         outcome: "converged", or the name of the outcome that ended the run early.
         path: Followed path of equilibria (`ddg_warp.scene.equilibrium_path.Path`), if that was the analysis.
+        choice: Step and rtol (`ddg_warp.run.step_choice.StepChoice`) chosen for `Dynamics(error=...)`; None without. The `step_times`
+            are then times of all steps within dt.
         learned: Data that the scene's check learned from the run, for its plot; None without.
     """
 
@@ -64,6 +66,7 @@ class Result:
     failure: str = ""
     outcome: str = "converged"
     path: Any = None
+    choice: Any = None
     learned: Any = None
 
     def __repr__(self) -> str:
@@ -169,6 +172,8 @@ def simulate(
     if not dynamic and (dt, duration, resume) != (None, None, None):
         raise InputError("this scene is static: it takes no dt, no duration and nothing to resume")
     if dynamic:
+        if analysis.error is not None:
+            _check_error(scene, resume, options or {})
         stored = {"dt": analysis.dt, "duration": analysis.duration}
         if resume is not None:
             if force or (out is not None and Path(out) != Path(resume)):
@@ -275,6 +280,21 @@ def _check(worlds, fields, *, flags: Mapping, functions: Mapping, mappings: Mapp
             raise InputError(f"{name} is {value!r}; give the path of a directory")
 
 
+def _check_error(scene: Scene, resume, options: Mapping) -> None:
+    """Refuse settings that do not go with `Dynamics(error=...)`."""
+    if resume is not None:
+        raise InputError("a run with Dynamics(error=...) is not resumed; record it again, or give dt and rtol instead")
+    if scene.callbacks:
+        raise InputError(
+            "Dynamics: error takes pilot runs, and callbacks of the scene would be called in each; leave out callbacks or error"
+        )
+    for name in ("rtol", "unconverged_fraction"):
+        if name in options:
+            raise InputError(f"options: {name} does not go with Dynamics(error=...); leave out one of them")
+    if options.get("failures", "raise") != "raise":
+        raise InputError("options: failures='flag' does not go with Dynamics(error=...); leave out one of them")
+
+
 def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar, counts: Mapping) -> None:
     """Step to the end and `keep` each state. The scene's callbacks run inside of `integrator.step`.
 
@@ -285,10 +305,16 @@ def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clo
         counts: Counters of a resumed run, see `counts_of`.
     """
     from ddg_warp.run.counts import counts_of, repeat, statistics
+    from ddg_warp.run.step_choice import choose_step
     from ddg_warp.solve.stepping.integrator import Integrator
 
     analysis = result.scene.analysis
     settings = {name: getattr(analysis, name) for name in ("scheme", "rtol", "unconverged_fraction")}
+    if analysis.error is not None:
+        bar.set_description("choosing step and rtol")
+        result.choice = choose_step(result.model, result.state, result.dt, steps, analysis.error, settings | options)
+        settings["rtol"] = result.choice.rtol
+    substeps = 2**result.choice.halvings if result.choice else 1
     integrator = Integrator(result.model, **settings | options)
     counted = partial(counts_of, integrator)
     if not result.times:
@@ -297,7 +323,8 @@ def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clo
     try:
         for _ in range(round(float(state.time) / result.dt), steps):
             started = clock()
-            state = integrator.step(state, result.dt)
+            for _ in range(substeps):
+                state = integrator.step(state, result.dt / substeps)
             result.step_times.append(clock() - started)
             keep(state, counts=counted)
             bar.update()

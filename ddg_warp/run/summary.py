@@ -7,6 +7,7 @@ import os
 import platform
 import subprocess
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -20,7 +21,7 @@ def summary(scene: str, parameters: Mapping, result, checks: Iterable) -> dict:
     """Return the content of summary.json.
 
     Optional entries: `failure` if the solver failed, `stable` for equilibria (null: not tested), `contact` for scenes with contact
-    (law and `statistics()["contact"]` of the integrator or static solver).
+    (law and `statistics()["contact"]` of the integrator or static solver). `Dynamics(error=...)` adds `choice`, a `StepChoice`.
 
     All entries are of the whole run, resumptions included, except `ms_per_step`, which is of the run since the last one. If the file
     of a resumed run has no counters, counts and times begin at `counted_from` [s], and the energy at the start is null.
@@ -43,6 +44,8 @@ def summary(scene: str, parameters: Mapping, result, checks: Iterable) -> dict:
         "energy": result.energies,
         "checks": [check.as_dict() for check in checks],
     }
+    if result.choice is not None:
+        content["choice"] = asdict(result.choice)
     if "contact" in statistics:
         content["contact"] = {"law": result.scene.contact_settings.name, **statistics["contact"]}
     if result.counted_from is not None:

@@ -92,7 +92,7 @@ refuse("rods read", {
 def run(**options):
     """Simulate clamped rods, by the given `analysis` if any."""
     scene = clamped()
-    scene.analysis = options.pop("analysis", ddg.Dynamics(0.01, 0.02))
+    scene.analysis, scene.callbacks = options.pop("analysis", ddg.Dynamics(0.01, 0.02)), options.pop("callbacks", [])
     return simulate(scene, device=DEVICE, **({"progress": False} | options))
 
 
@@ -104,6 +104,10 @@ refuse("simulate", {
     "part of a step": (lambda: run(dt=0.015), "no whole number of steps"),
     "dt of statics": (lambda: run(analysis=ddg.Statics(), dt=0.01), "static", "no dt"),
     "option": (lambda: run(options={"rtol": -1.0}), "rtol", "positive"),
+    "error and rtol": (lambda: run(analysis=ddg.Dynamics(0.01, 0.02, error=1e-3), options={"rtol": 1e-2}), "rtol", "error"),
+    "error and flags": (lambda: run(analysis=ddg.Dynamics(0.01, 0.02, error=1e-3), options={"failures": "flag"}), "failures", "error"),
+    "error and resume": (lambda: run(analysis=ddg.Dynamics(0.01, 0.02, error=1e-3), resume="out"), "error", "not resumed"),
+    "error and callbacks": (lambda: run(analysis=ddg.Dynamics(0.01, 0.02, error=1e-3), callbacks=[print]), "callbacks", "error"),
 })
 
 # --- command line ---

@@ -50,6 +50,11 @@ each("analysis", "duration", [0.0, INF, "long"], lambda v: ddg.Dynamics(duration
 each("analysis", "unconverged", [-0.1, 1.0, True], lambda v: ddg.Dynamics(unconverged_fraction=v), "unconverged_fraction", "from 0")
 each("analysis", "precision", ["double", 64], lambda v: ddg.Dynamics(precision=v), "Dynamics: precision", "float64")
 each("analysis", "scheme", ["rk4", None, 3], lambda v: ddg.Dynamics(scheme=v), "scheme", "implicit_euler")
+each("analysis", "error", [0.0, -1e-4, NAN, INF, "1e-4", True], lambda v: ddg.Dynamics(error=v), "Dynamics: error", "positive")
+refuse("analysis", {
+    "error with rtol": (lambda: ddg.Dynamics(error=1e-4, rtol=1e-2), "rtol", "leave out rtol or error"),
+    "error with unconverged": (lambda: ddg.Dynamics(error=1e-4, unconverged_fraction=0.1), "unconverged_fraction", "error"),
+})
 each("analysis", "load_steps", [0, 1.5, True, "two"], lambda v: ddg.Statics(load_steps=v), "load_steps", "whole number")
 each("analysis", "trace step", [0.0, -1.0, NAN], lambda v: ddg.PathAnalysis(step=v), "PathAnalysis: step", "positive")
 refuse("analysis", {

@@ -573,7 +573,7 @@ def analyse(analysis, **options) -> list:
 
 CALLS["Dynamics"] = Call(ddg.Dynamics, lambda **named: analyse(ddg.Dynamics(**named)), {"dt": 0.01, "duration": 0.02}, {
     "dt": 0.02, "duration": 0.03, "scheme": "implicit_midpoint", "rtol": 1e-1, "precision": "mixed",
-    "unconverged_fraction": Change(0.1, refused=True)})  # fmt: skip
+    "unconverged_fraction": Change(0.1, refused=True), "error": 1e-3})  # fmt: skip
 CALLS["Statics"] = Call(ddg.Statics, lambda **named: analyse(ddg.Statics(**named)), {}, {"load_steps": 2})
 TIP = {"tip": ddg.Displacement.of(5, "z")}
 CALLS["Trace"] = Call(ddg.PathAnalysis, lambda **named: analyse(ddg.PathAnalysis(**named)), {"stop": ddg.StopCriterion(steps=2)}, {
