@@ -311,8 +311,9 @@ def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clo
     analysis = result.scene.analysis
     settings = {name: getattr(analysis, name) for name in ("scheme", "rtol", "unconverged_fraction")}
     if analysis.error is not None:
-        bar.set_description("choosing step and rtol")
-        result.choice = choose_step(result.model, result.state, result.dt, steps, analysis.error, settings | options)
+        result.choice = choose_step(
+            result.model, result.state, result.dt, steps, analysis.error, settings | options, bar
+        )
         settings["rtol"] = result.choice.rtol
     substeps = 2**result.choice.halvings if result.choice else 1
     integrator = Integrator(result.model, **settings | options)

@@ -52,7 +52,7 @@ class StepChoice:
         )
 
 
-def choose_step(model, start, dt: float, steps: int, error: float, options: Mapping) -> StepChoice:
+def choose_step(model, start, dt: float, steps: int, error: float, options: Mapping, bar) -> StepChoice:
     """Choose step and rtol of a run by pilot runs.
 
     Args:
@@ -61,6 +61,7 @@ def choose_step(model, start, dt: float, steps: int, error: float, options: Mapp
         steps: Number of steps of dt to the end.
         error: Largest error of a node at the end [m].
         options: Keyword arguments of the `Integrator`, but rtol.
+        bar: Progress bar, which describes the pilot run.
 
     Raises:
         SolverError: No step down to dt / 2^11 and no rtol down to 1e-6 are estimated to suffice, or a pilot run fails.
@@ -73,6 +74,7 @@ def choose_step(model, start, dt: float, steps: int, error: float, options: Mapp
         """Return the points at the end of a run."""
         nonlocal runs
         integrator, state, runs = Integrator(model, **{**options, "rtol": rtol}), start, runs + 1
+        bar.set_description(f"pilot run {runs}, steps of {dt / 2**halvings:g} s")
         for _ in range(steps * 2**halvings):
             state = integrator.step(state, dt / 2**halvings)
         integrator.check(state)
