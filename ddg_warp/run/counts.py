@@ -88,7 +88,7 @@ def _counters(integrator) -> dict:
         result |= {
             "contact/crossed": tally.crossed,
             "contact/least": tally.least,
-            "contact/searches": search.searches,
+            "contact/searches": search.counters.searches,
         }
         result |= {"contact/counts": tally.counts, "contact/friction_work": tally.work}
     return result
@@ -106,4 +106,4 @@ def _candidates(search) -> int:
 
 def _paths(search) -> dict:
     """Return start and end of the motion that candidates were searched for, by name."""
-    return {"start": search._start, "end": search._end}
+    return {"start": search.validity.start, "end": search.validity.end}

@@ -71,5 +71,5 @@ class Motion:
     def results(self) -> list[bytes]:
         """Return all outputs of a filter but the candidate lists, as bytes."""
         search = self.search
-        ends = search._start, search._end
+        ends = search.validity.start, search.validity.end
         return [array.numpy().tobytes() for array in (self.q, search.shares, search.time, search.limited, *ends)]

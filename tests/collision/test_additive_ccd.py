@@ -142,12 +142,12 @@ def test_crossings_are_found_without_a_new_search(device):
     shapes.rod([2, 3], 1e-4)
     x = upload(points, device)
     search = BroadPhase(shapes, x, search_distance=REACH, margin=MARGIN)
-    searches = search.searches.numpy()[0]
+    searches = search.counters.searches.numpy()[0]
     for fall in (2.9e-3, 3.1e-3, 4.9e-3, 5.1e-3, 2.0):
         search.check_crossings(x, upload(points - np.outer([0, 0, 1, 1], [0.0, 0.0, fall]), device))
         assert search.crossed.numpy()[0] == (fall > 3e-3)
     search.update(x)
-    assert search.searches.numpy()[0] == searches
+    assert search.counters.searches.numpy()[0] == searches
 
 
 def test_crossings_equal_roots_of_signed_volumes(device):

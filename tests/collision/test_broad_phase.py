@@ -118,11 +118,11 @@ def test_overflowing_lists_are_empty_until_they_grow(device, room):
     for pairs in search.lists:
         pairs.reserve(*room)
     search.search(x)
-    assert search.overflow.numpy()[0] == 1
+    assert search.counters.overflow.numpy()[0] == 1
     assert not any(len(candidates) for candidates in candidate_pairs(search))
-    searches = search.searches.numpy()[0]
+    searches = search.counters.searches.numpy()[0]
     search.update(x)
-    assert search.searches.numpy()[0] == searches + 1  # candidates stay invalid until lists have room
+    assert search.counters.searches.numpy()[0] == searches + 1  # candidates stay invalid until lists have room
     version = search.version
     assert search.fit(x)
     assert search.version > version
@@ -158,12 +158,12 @@ def test_candidates_are_valid_for_half_the_margin(device, excess):
     shapes.rod([2, 3], 0.01)
     search = BroadPhase(shapes, upload(points, device), search_distance=REACH, margin=MARGIN)
     assert not len(candidate_pairs(search)[0])
-    searches = search.searches.numpy()[0]
+    searches = search.counters.searches.numpy()[0]
     moved = points.copy()
     moved[:2, 2] += (0.5 + excess) * MARGIN
     moved[2:, 2] -= (0.5 + excess) * MARGIN
     search.update(upload(moved, device))
-    assert search.searches.numpy()[0] == searches + (excess > 0)
+    assert search.counters.searches.numpy()[0] == searches + (excess > 0)
     assert len(candidate_pairs(search)[0]) == (excess > 0)
     # without a new search, pairs that are not listed are beyond the reach
     assert near_pairs(shapes, moved, 2, 2, REACH) <= {tuple(pair) for pair in candidate_pairs(search)[0].tolist()}
@@ -176,10 +176,10 @@ def test_dofs_of_no_primitive_trigger_no_search(device):
     shapes.rod([0, 1], 0.01)
     search = BroadPhase(shapes, upload(np.tile(points, (2, 1)), device), 2, search_distance=REACH, margin=MARGIN)
     for node, more in ((2, 0), (5, 0), (1, 1), (4, 1)):
-        searches, x = search.searches.numpy()[0], np.tile(points, (2, 1))
+        searches, x = search.counters.searches.numpy()[0], np.tile(points, (2, 1))
         x[node, 0] += 2.0 * MARGIN
         search.update(upload(x, device))
-        assert search.searches.numpy()[0] == searches + more
+        assert search.counters.searches.numpy()[0] == searches + more
         search.search(upload(np.tile(points, (2, 1)), device))
 
 
@@ -193,13 +193,13 @@ def test_captured_update_searches_only_where_needed(device):
     rng, position = np.random.default_rng(7), points.copy()
     velocity = rng.normal(size=points.shape)
     velocity *= 0.3 * MARGIN / np.linalg.norm(velocity, axis=1, keepdims=True)
-    before = search.searches.numpy()[0]
+    before = search.counters.searches.numpy()[0]
     for step in range(1, 7):
         position += velocity
         x.assign(position)
         wp.capture_launch(capture.graph)
         assert not search.fit(x)
-        assert search.searches.numpy()[0] == before + step // 2
+        assert search.counters.searches.numpy()[0] == before + step // 2
         for candidates, side in zip(candidate_pairs(search), SIDES, strict=True):
             assert near_pairs(shapes, position, *side, REACH) <= {tuple(pair) for pair in candidates.tolist()}
     search.search(x)

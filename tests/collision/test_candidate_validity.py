@@ -47,7 +47,7 @@ def test_cut_motion_continues_without_a_new_search(device, kind, dtype):
     move = rng.normal(size=(motion.num_ccd_bodies, 3))[motion.ccd_body.numpy()] * 6.0 * MARGIN
     positions = motion(move).astype(float)
     assert (motion.search.shares.numpy() < 1.0).sum() > 3
-    first = motion.search.searches.numpy()[0]
+    first = motion.search.counters.searches.numpy()[0]
     alone = candidate_pairs(BroadPhase(shapes, upload(positions, device, dtype), search_distance=REACH, margin=MARGIN))
     for fraction in (0.05, 0.1, 0.2, 0.5, 1.0):
         motion.base.assign(positions)
@@ -58,7 +58,7 @@ def test_cut_motion_continues_without_a_new_search(device, kind, dtype):
         motion.search.update(upload(wide, device, dtype))
         count += count_near_pairs(motion.search, wide)
         assert count > 20
-    assert motion.search.searches.numpy()[0] == first
+    assert motion.search.counters.searches.numpy()[0] == first
     # candidates made where the motion was cut would not suffice
     missed = [
         near_pairs(shapes, positions, *side, REACH) - {tuple(p) for p in candidates.tolist()}
@@ -72,14 +72,14 @@ def test_candidates_are_complete_within_half_the_margin_of_the_motion(device):
     rng = np.random.default_rng(23)
     move = 2.0 * MARGIN * rng.normal(size=points.shape)
     search = search_motion(shapes, upload(points, device), upload(move, device))
-    searches = search.searches.numpy()[0]
+    searches = search.counters.searches.numpy()[0]
     count = 0
     for k in range(20):
         fractions = rng.uniform(size=(len(points), 1)) ** rng.choice([0.2, 1.0, 5.0])
         x = points + fractions * move + random_offsets(rng, len(points), (0.4999, 0.25)[k % 2] * MARGIN)
         search.update(upload(x, device))
         count += count_near_pairs(search, x)
-    assert search.searches.numpy()[0] == searches
+    assert search.counters.searches.numpy()[0] == searches
     assert count > 200
 
 
@@ -96,12 +96,12 @@ def test_search_starts_beyond_half_the_margin_off_the_motion(device, excess, fra
     shapes.rod([0, 1], 0.01)
     move = np.array([[5.0 * MARGIN, 0.0, 0.0]] * 2)
     search = search_motion(shapes, upload(points, device), upload(move, device))
-    searches = search.searches.numpy()[0]
+    searches = search.counters.searches.numpy()[0]
     displaced = points + fraction * move
     displaced[1] += (0.5 + excess) * MARGIN * np.array(off)
     current, elsewhere = upload(displaced, device), upload(points + 0.7 * move, device)
     search.update(*((current, elsewhere) if argument == "base" else (elsewhere, current)))
-    assert search.searches.numpy()[0] == searches + (excess > 0.0)
+    assert search.counters.searches.numpy()[0] == searches + (excess > 0.0)
 
 
 def test_candidates_of_a_common_motion_hold_at_its_end_alone(device):
@@ -111,19 +111,19 @@ def test_candidates_of_a_common_motion_hold_at_its_end_alone(device):
     x, end = upload(points, device), upload(points + move, device)
     for together in (0, 1):
         search = search_motion(shapes, x, upload(move, device), together)
-        searches = search.searches.numpy()[0]
+        searches = search.counters.searches.numpy()[0]
         search.update(end)
-        assert search.searches.numpy()[0] == searches
+        assert search.counters.searches.numpy()[0] == searches
         search.update(x)
-        assert search.searches.numpy()[0] == searches + together
+        assert search.counters.searches.numpy()[0] == searches + together
     motion = Motion(shapes, points, device, together=(0,))
     landing = motion(move)
     assert 0.0 < motion.search.time.numpy()[0] < 1.0
-    searches = motion.search.searches.numpy()[0]
+    searches = motion.search.counters.searches.numpy()[0]
     motion.search.update(upload(landing, device))
-    assert motion.search.searches.numpy()[0] == searches
+    assert motion.search.counters.searches.numpy()[0] == searches
     motion.search.update(end)
-    assert motion.search.searches.numpy()[0] == searches + 1
+    assert motion.search.counters.searches.numpy()[0] == searches + 1
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.02, 0.2])
@@ -170,9 +170,9 @@ def test_search_serves_the_next_motion(device, dtype):
             base, q = points + step * speed, points + (step + 1) * speed
             bends = random_offsets(rng, len(points), 0.4 * MARGIN) if step == 1 else 0.0
             motion_ends = [upload(x, device, dtype) for x in (base, q + bends)]
-            before = int(search.searches.numpy()[0])
+            before = int(search.counters.searches.numpy()[0])
             search.update(*motion_ends, flag)
-            counts.append(int(search.searches.numpy()[0]) - before)
+            counts.append(int(search.counters.searches.numpy()[0]) - before)
             if search.fit(motion_ends[0]):  # there is room now
                 search.search(motion_ends[0], upload(AHEAD * speed, device, dtype))
             if not together:

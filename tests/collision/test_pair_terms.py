@@ -203,7 +203,7 @@ def test_captured_evaluation_follows_motion(device):
         result.product(direction, out)
         result.join()
     velocity = 0.3 * MARGIN * v / np.linalg.norm(v, axis=1, keepdims=True)
-    searches = result.search.searches.numpy()[0]
+    searches = result.search.counters.searches.numpy()[0]
     for step in range(1, 5):
         positions.assign(x + step * velocity)
         wp.capture_launch(capture.graph)
@@ -213,7 +213,7 @@ def test_captured_evaluation_follows_motion(device):
         assert (out.numpy() * v).sum() == pytest.approx(
             brute_force_energy(shapes, x + step * velocity, "penalty", v), rel=1e-6
         )
-    assert result.search.searches.numpy()[0] == searches + 2
+    assert result.search.counters.searches.numpy()[0] == searches + 2
 
 
 def test_parameters_are_per_pair_of_groups(device):

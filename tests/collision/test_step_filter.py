@@ -56,9 +56,9 @@ def test_limited_motions_close_no_gap_and_never_cross(device, kind, size, dtype)
         # candidates are valid at the end of the motion
         for side, candidates in zip(SIDES, candidate_pairs(search), strict=True):
             assert near_pairs(shapes, landing, *side, REACH) <= {tuple(pair) for pair in candidates.tolist()}
-        searches = search.searches.numpy()[0]
+        searches = search.counters.searches.numpy()[0]
         search.update(upload(landing + 0.49 * MARGIN / np.sqrt(3.0), device, dtype))
-        assert search.searches.numpy()[0] == searches
+        assert search.counters.searches.numpy()[0] == searches
         motion.base.assign(landing)
     if size == 0.5:
         assert fractions.min() < 0.1
@@ -218,8 +218,8 @@ def test_captured_filter_equals_uncaptured(device):
             step()
             result += motion.results() + [part.tobytes() for part in candidate_pairs(motion.search)]
             motion.base.assign(motion.q.numpy())
-        assert not motion.search.overflow.numpy()[0]
-        return [*result, motion.search.searches.numpy()[0]]
+        assert not motion.search.counters.overflow.numpy()[0]
+        return [*result, motion.search.counters.searches.numpy()[0]]
 
     plain = run(False)
     assert run(False) == plain
@@ -235,7 +235,7 @@ def test_overflowing_lists_stop_all_motion(device):
     motion.launch()
     used = motion.ccd_body.numpy() >= 0
     assert (motion.q.numpy()[used] == points[used]).all()
-    assert motion.search.time.numpy()[0] == 0.0 and motion.search.overflow.numpy()[0] == 1
+    assert motion.search.time.numpy()[0] == 0.0 and motion.search.counters.overflow.numpy()[0] == 1
 
 
 def test_smallest_gaps(device):

@@ -14,13 +14,13 @@ from ddg_warp.kernels.collision.ccd.additive_ccd import impact_kernel
 from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, POINT_PLANE, POINT_TRIANGLE
 from ddg_warp.solve.collision.bvh import Primitives
 from ddg_warp.solve.collision.candidate_list import CandidateList
+from ddg_warp.solve.collision.candidate_validity import CandidateValidity, SearchCounters
 from ddg_warp.solve.collision.collision_mesh import BALLS, PLANES, CollisionMesh
 from ddg_warp.solve.collision.step_filter import StepFilter
 from ddg_warp.timers import timer
 
 SLACK = 1e-3  # relative excess of the skin margin in searches, for rounding
 NONE = np.iinfo(np.int64).max
-MORE = 16  # counters of other objects that are read in the same transfer
 
 
 class BroadPhase:
@@ -44,12 +44,9 @@ class BroadPhase:
 
     Attributes:
         lists: a `CandidateList` for each kind of pairs in the mesh.
-        overflow: (1,), nonzero after a capacity overflow, also in `impact` and `crossings`. Then call `fit`, and redo all that used
-            the pairs.
-        `searches`: (1,) number of searches.
-        `looks`: (1,) counter of `RodCulling`.
-        `sought`: both, as of the last `fit` or `check`.
-        `more`, `more_read`: (MORE,) counters of other objects, and the values of the last `fit` or `check`.
+        counters: the `SearchCounters`, read by `fit` and `check`. After an overflow, also in `impact` and `crossings`, call `fit`,
+            and redo all that used the pairs.
+        validity: the `CandidateValidity`.
         `gap`, `time`, `crossed`: [m], step fraction, count of each world; see `measure`, `impact` and `crossings`.
         `shares`, `limited`: CCD step fractions (worlds times CCD bodies,), and the number below 1 of each world; see `filter`.
         `every`: (worlds,) ones, for motions with a single step fraction in every world.
@@ -89,31 +86,17 @@ class BroadPhase:
             radius = wp.array(np.tile(shapes.radii, (worlds, 1)), dtype=real, device=self.device)
         primitives = {size: Primitives(shapes, size, worlds, real, self.device, radius) for size in shapes.sizes}
         self._primitives = list(primitives.values())
-        self._still, self._move, self._way = (wp.zeros(len(x), dtype=x.dtype, device=self.device) for _ in range(3))
-        self._start, self._end = (wp.zeros_like(x) for _ in range(2))  # motion of the last search
-        used = np.zeros(nodes, np.uint8)  # nodes of no primitive may be no positions, as edge blocks
-        for size in shapes.sizes:
-            used[shapes.primitives(size)[0]] = 1
-        self._placed = wp.array(used, dtype=wp.uint8, device=self.device)
+        self._still = wp.zeros_like(x)
         self._shift = wp.zeros(worlds, dtype=x.dtype, device=self.device)
         self._never, self.every = (wp.full(worlds, flag, dtype=int, device=self.device) for flag in (0, 1))
-        # one transfer after every step: each takes as long as a kernel or two
-        self._memory = wp.zeros(2 + MORE, dtype=wp.int64, device=self.device)
-        counters = wp.array(ptr=self._memory.ptr, shape=4, dtype=int, device=self.device)
-        self.overflow, self._lost, self.searches, self.looks = (counters[k : k + 1] for k in range(4))
-        self._reading = device_arrays.Reading(self._memory)
-        self.more, self.more_read = self._memory[2:], np.zeros(MORE, np.int64)
-        self.sought = (0, 0)
-        # candidates outdated, outdated for the check of a whole step, searched by the last `update`
-        self._stale, self._beyond, self._done = (wp.zeros(1, dtype=int, device=self.device) for _ in range(3))
+        self.counters, self.validity = SearchCounters(self.device), CandidateValidity(shapes, x, self.margin)
         self._edges = primitives[2]
         self._walked = [part for part in self._primitives if part.walked]
-        self._motion = motion_kernels(real, device_arrays.serial(self.device))
+        *_, self._common = motion_kernels(real, device_arrays.serial(self.device))
         self.rebuild(x)
-        several_worlds = worlds > 1
         sides = (EDGES, 2, 2), (POINT_TRIANGLE, 1, 3), (EDGE_POINT, 2, BALLS), (POINT_PLANE, 1, PLANES)
         self.lists = [
-            CandidateList(kind, primitives[first], primitives[second], shapes, several_worlds, real, self.overflow)
+            CandidateList(kind, primitives[first], primitives[second], shapes, worlds > 1, real, self.counters.overflow)
             for kind, first, second in sides
             if second in primitives
         ]
@@ -137,7 +120,7 @@ class BroadPhase:
         """Kernels to load before a capture of a step, which has no `impact`."""
         lists = [kernel for pairs in self.lists for kernel in pairs.kernels]
         boxes = [kernel for part in self._primitives for kernel in part.kernels]
-        return [*lists, *boxes, *self._motion, *self._passes, *self._filter.kernels]
+        return [*lists, *boxes, *self.validity.kernels, self._common, *self._passes, *self._filter.kernels]
 
     @property
     def shares(self) -> wp.array:
@@ -164,18 +147,17 @@ class BroadPhase:
         worlds with a single step fraction; there the candidates of an unfiltered motion hold from q on.
         """
         together = self._never if together is None else together
-        _, lengthen, *_ = self._motion
+        validity = self.validity
 
         def anew() -> None:
             if q is None:
                 self.search(base)
                 return
-            self._sweep(lengthen, base, [self._move, together], [self._way])
-            self.search(base, self._way, together)
+            self.search(base, validity.lengthen(together), together)
 
-        self._done.zero_()
-        self._watch(base, base if q is None else q, self._stale)
-        wp.capture_if(self._stale, anew)
+        validity.done.zero_()
+        validity.watch(base, base if q is None else q, validity.stale)
+        wp.capture_if(validity.stale, anew)
 
     @timer("broad phase")
     def search(self, x: wp.array, move: wp.array | None = None, together: wp.array | None = None) -> None:
@@ -194,15 +176,7 @@ class BroadPhase:
             pairs.narrow_phase(x, move, together, self.search_distance, self._around)
 
         device_arrays.side_by_side([partial(find, pairs) for pairs in self.lists], self.device)
-        _, _, mark, _ = self._motion
-        outputs = [self._start, self._end, self._stale, self._done, self.searches]
-        self._sweep(mark, x, [x, move, together, self._placed, self.overflow], outputs)
-
-    def _watch(self, base: wp.array, q: wp.array, stale: wp.array) -> None:
-        """Mark candidates as `stale` (1,) for a motion, which becomes the present one; see the class."""
-        watch, *_ = self._motion
-        inputs = [base, q, self._start, self._end, self._placed, 0.5 * self.margin]
-        self._sweep(watch, base, inputs, [self._move, stale])
+        self.validity.mark(x, move, together, self.counters)
 
     def filter(
         self,
@@ -230,17 +204,17 @@ class BroadPhase:
         _checked_keep(min_separation_fraction)
         self._filter.check(ccd_body, together, num_ccd_bodies)
         self.update(base, q, together)
-        search = (self.overflow, self.time, self._done, self._start, self._end)
         self._filter(
             base,
-            self._move,
             q,
             ccd_body,
             together,
             num_ccd_bodies,
             min_separation_fraction,
             self._room(min_separation_fraction),
-            search,
+            self.counters.overflow,
+            self.validity,
+            self.time,
         )
 
     def fit(self, x: wp.array, shorten: Callable[[], bool] | None = None) -> bool:
@@ -256,7 +230,7 @@ class BroadPhase:
         """
         grown = False
         while self._checked():
-            self.overflow.zero_()
+            self.counters.overflow.zero_()
             spare = shorten is not None and any(pairs.is_overfull for pairs in self.lists) and shorten()
             for pairs in self.lists:
                 pairs.dismiss() if spare else pairs.fit()
@@ -275,12 +249,10 @@ class BroadPhase:
 
     def _checked(self) -> bool:
         """Refuse positions that are not finite; return True after a capacity overflow."""
-        memory = self._reading()
-        overflow, lost, *sought = memory[:2].view(np.int32).tolist()
-        self.sought, self.more_read, node = tuple(sought), memory[2:], lost - 1
-        if node >= 0:
-            self._lost.zero_()
-            world, node = divmod(node, len(self.shapes.points))
+        overflow, lost = self.counters.read()
+        if lost:
+            self.counters.lost.zero_()
+            world, node = divmod(lost - 1, len(self.shapes.points))
             raise SolverError(
                 f"node {node} of world {world} has a position or displacement that is not finite; go back to the last good state",
                 outcome="not_finite",
@@ -320,9 +292,10 @@ class BroadPhase:
 
     def check_crossings(self, base: wp.array, q: wp.array) -> None:
         """Count interpenetrating pairs from `base` to q, among candidates alone if these are valid, which is faster."""
-        self._beyond.zero_()
-        self._watch(base, q, self._beyond)
-        wp.capture_if(self._beyond, lambda: self.crossings(base, self._move), lambda: self.passing(base))
+        validity = self.validity
+        validity.beyond.zero_()
+        validity.watch(base, q, validity.beyond)
+        wp.capture_if(validity.beyond, lambda: self.crossings(base, validity.move), lambda: self.passing(base))
 
     def passing(self, base: wp.array, min_separation_fraction: float = 0.0) -> None:
         """Count interpenetrating candidates, which have to be valid, in the present motion from `base`.
@@ -331,7 +304,7 @@ class BroadPhase:
         """
         self.crossed.zero_()
         for pairs in self.lists:
-            pairs.cross(base, self._move, self.crossed, min_separation_fraction, self.search_distance)
+            pairs.cross(base, self.validity.move, self.crossed, min_separation_fraction, self.search_distance)
 
     def first_crossing(self) -> str:
         """Return the names of the first interpenetrating pair, or nothing. Reads from the device."""
@@ -379,18 +352,11 @@ class BroadPhase:
         """Return the search distance, within which gaps close step by step; 0 if gaps may close."""
         return self.search_distance if min_separation_fraction > 0.0 else 0.0
 
-    def _find_common(self, move, together) -> None:
-        *_, common = self._motion
-        inputs = [self._edges.surface, self._edges.count, move, together]
-        wp.launch(common, self.worlds, inputs, [self._shift], device=self.device)
-
     def _enclose(self, x, move, together, radius_fraction: float, margin: float) -> None:
-        self._find_common(move, together)
+        inputs = [self._edges.surface, self._edges.count, move, together]
+        wp.launch(self._common, self.worlds, inputs, [self._shift], device=self.device)
         for primitives in self._primitives:
-            primitives.enclose(x, move, self._shift, radius_fraction, margin, self._lost)
-
-    def _sweep(self, kernel, x, inputs: list, outputs: list) -> None:
-        device_arrays.sweep(kernel, len(x), inputs, outputs, self.device)
+            primitives.enclose(x, move, self._shift, radius_fraction, margin, self.counters.lost)
 
 
 def _checked_keep(min_separation_fraction: float) -> None:

@@ -218,7 +218,7 @@ class ContactPotential:
 
         push = [partial(part.evaluate, x, self.law, self.gap) for part in self.lists]
         device_arrays.side_by_side([*push, *([evaluate_friction] if self.frictions else [])], self.device)
-        device_arrays.side_by_side([self._sum_up, partial(self._totals, self.search.overflow)], self.device)
+        device_arrays.side_by_side([self._sum_up, partial(self._totals, self.search.counters.overflow)], self.device)
 
     def _sum_up(self) -> None:
         self.blocks.collect(self.products.sets, self.forces)

@@ -63,7 +63,7 @@ class RodCulling:
         self.doubt = self.known[DOUBT]
         self.doubt.fill_(1)
         self.known[AHEAD].fill_(FIRST)
-        self._again, self.looks = wp.zeros(1, dtype=int, device=device), search.looks
+        self._again, self.looks = wp.zeros(1, dtype=int, device=device), search.counters.looks
         serial = device_arrays.serial(device)
         *_, self._common = motion_kernels(real, serial)
         made = run_kernels(worlds > 1, real, serial)

@@ -53,7 +53,7 @@ class ContactStatistics:
 
     @property
     def _all(self) -> list[wp.array]:
-        return [self.crossed, self.least, self.terms.search.searches, *self.arrays]
+        return [self.crossed, self.least, self.terms.search.counters.searches, *self.arrays]
 
     def __call__(self, flags: wp.array) -> None:
         """Add the terms as evaluated last, in worlds whose flags say that a substep is done."""
@@ -69,7 +69,7 @@ class ContactStatistics:
         counts, least, search = self.counts.numpy(), self.least.numpy()[0], self.terms.search
         mean = (counts[SUM] / counts[PARTS].clip(1)).sum()
         result = {
-            "searches": int(search.searches.numpy()[0]),
+            "searches": int(search.counters.searches.numpy()[0]),
             "refused_crossings": int(self.crossed.numpy()[0]),
             "smallest_gap": float(least) if least < least.dtype.type(search.search_distance) else math.inf,
             "candidates": sum(int(pairs.count.numpy()[0]) for pairs in search.lists),

@@ -7,6 +7,7 @@ import warp as wp
 from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.collision.ccd.step_fractions import fraction_kernels, limit_kernels
+from ddg_warp.solve.collision.candidate_validity import CandidateValidity
 from ddg_warp.timers import timer
 
 
@@ -54,21 +55,25 @@ class StepFilter:
     def __call__(
         self,
         base,
-        move,
         q,
         ccd_body,
         together,
         num_ccd_bodies: int,
         min_separation_fraction: float,
         search_distance: float,
-        search,
+        overflow: wp.array,
+        validity: CandidateValidity,
+        time: wp.array,
     ) -> None:
         """Lower step fractions round by round, and limit q accordingly.
 
         Args:
-            search_distance: search distance [m]; search: (overflow, time, done, start, end) of a `BroadPhase`.
+            search_distance: search distance [m].
+            overflow: see `SearchCounters`.
+            validity: has the motion from `base` to q; searched paths are limited with it.
+            time: (worlds,) smallest fractions, as of `BroadPhase`.
         """
-        overflow, time, done, *motion = search
+        move = validity.move
         shares, before, lowered = (array[: self._worlds * num_ccd_bodies] for array in self._all)
         self.shares = shares
         self._sweep(self._start, len(shares), [], [shares, before, lowered])
@@ -112,7 +117,8 @@ class StepFilter:
         wp.capture_while(self._changed, lambda: go(self._later))
         outputs = [shares, time, self.limited]
         self._sweep(self._finish, len(shares), [self._earliest, self._open, overflow], outputs)
-        self._sweep(self._shorten, len(q), [base, move, ccd_body, num_ccd_bodies, shares, done, together], [q, *motion])
+        inputs = [base, move, ccd_body, num_ccd_bodies, shares, validity.done, together]
+        self._sweep(self._shorten, len(q), inputs, [q, validity.start, validity.end])
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
         device_arrays.sweep(kernel, count, inputs, outputs, self._device)

@@ -261,7 +261,7 @@ class CoupledEquilibrium:
         """
         pairs = self._active_pairs or [0]
         result = {
-            "searches": int(self.newton.contact.search.searches.numpy()[0]),
+            "searches": int(self.newton.contact.search.counters.searches.numpy()[0]),
             "smallest_gap": self._least,
             "contacts": {"mean": float(np.mean(pairs)), "last": pairs[-1]},
         }

@@ -128,7 +128,7 @@ class NewtonContact:
 
     def account(self, norms, islands) -> None:
         """Add the energy change of contact to worlds, and the rounding floor."""
-        inputs = [self.terms.energy, self.terms.gap, self.diagnosis.least, self.search.overflow]
+        inputs = [self.terms.energy, self.terms.gap, self.diagnosis.least, self.search.counters.overflow]
         inputs += [islands.arrays[0], self._kept, norms.of_worlds[0], norms.of_worlds[1]]
         self._launch(self._account, inputs, [])
 
@@ -161,7 +161,7 @@ class NewtonContact:
     def finish(self, before: wp.array, iterates, islands) -> None:
         """Refuse substeps with interpenetration."""
         self.search.check_crossings(before, iterates.q)
-        inputs = [self.search.crossed, self.terms.gap, self.search.overflow, *islands.arrays]
+        inputs = [self.search.crossed, self.terms.gap, self.search.counters.overflow, *islands.arrays]
         self._launch(self._refuse, inputs, [self.tally.crossed, self.tally.least])
         self.tally(islands.arrays[0])
 

@@ -77,7 +77,7 @@ class CoupledStep(StepDriver):
             if solver.contact:
                 solver.contact.tally.go_on(counts_of.newton.contact.tally)
         if solver.contact:
-            tally = solver.contact.search.more[: len(self.tally)]
+            tally = solver.contact.search.counters.more[: len(self.tally)]
             wp.copy(tally, self.tally)
             self.tally = tally
         self._counts = [*self.islands.arrays, self.tally, self.work, self.newton.pcg_work]
@@ -130,7 +130,7 @@ class CoupledStep(StepDriver):
         due = anew or self._since_renewal % RENEWAL == 0
         fresh = anew or self._since_renewal == 0
         self._since_renewal += 1
-        (searches, looks), before = self.newton.contact.search.sought, self._sought
+        (searches, looks), before = self.newton.contact.search.counters.sought, self._sought
         if due and (fresh or searches != before[0]):
             self._sought = searches, looks
             return TREES
@@ -242,7 +242,7 @@ class CoupledStep(StepDriver):
     def _counted(self) -> np.ndarray:
         """`tally` after the last step; with contact, as read by `has_overflow`."""
         contact = self.newton.contact
-        return contact.search.more_read[: len(self.tally)] if contact else super()._counted()
+        return contact.search.counters.more_read[: len(self.tally)] if contact else super()._counted()
 
     def predict(self, before):
         """Launch the predictor, with supports at their prescribed positions; return the state of `_start_frames`."""

@@ -120,7 +120,8 @@ class DecoupledStep:
             signal.zero_()
         search.update(before.q)
         search.measure(before.q, enough=search.search_distance)
-        inputs = [search.gap, search.search_distance, search.overflow, step.islands.arrays[1], self._world_status]
+        overflow, (_, scalars) = search.counters.overflow, step.islands.arrays
+        inputs = [search.gap, search.search_distance, overflow, scalars, self._world_status]
         self._launch(self._hope, self.coupled.worlds, inputs, [self._any_tried, step.remaining])
         wp.capture_if(self._any_tried, lambda: self._try_and_search(before, after))
 
@@ -212,7 +213,7 @@ class DecoupledStep:
             search.gap,
             search.search_distance,
             search.crossed,
-            search.overflow,
+            search.counters.overflow,
             step.rounded,
         ]
         inputs += [self._known, self._world_status, *step.islands.arrays, step.newton.contact.tally.counts]
