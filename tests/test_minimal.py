@@ -67,7 +67,7 @@ def test_springs_have_no_angles_and_no_frames(device):
     newton = integrator._rod_steps[0].newton
     assert newton.direction.shape[0] == 3
     assert newton.elimination.shape[0] == 2 * 9 + 3
-    assert newton.theta.size == newton.target_angle.size == 1
+    assert newton.iterates.theta.size == newton.iterates.target_angle.size == 1
     assert state.points()[-1, 2] < 0.0  # it falls
 
 

@@ -1,7 +1,5 @@
 """VJP of drag in the steps of a rod group and of the coupled system; see `kernels.adjoint.drag`."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import warp as wp
 from scipy import sparse
@@ -38,11 +36,6 @@ class RodDragAdjoint:
         """Kernels to load before a capture."""
         return [self._edges, self._nodes, *self.drag.kernels]
 
-    def resist(self, before, tangents: wp.array, solver, islands) -> None:
-        """Write inertia and drag of a solve from the state `before` to a solver, with the tangents of that solve; launches only."""
-        target = SimpleNamespace(x=tangents, mass=solver.mass, rotary=solver.rotary, target_angle=solver.target_angle)
-        self.drag.resist(before, target, islands)
-
     def matrix(self, before, tangents: wp.array, rate: float) -> sparse.csc_matrix:
         """Return the drag matrix of a solve, in the dof order of a `RodTangent`."""
         group, kind, real, device = self.group, self.group.kind, self.model.types.real, self.model.wp_device
@@ -51,15 +44,11 @@ class RodDragAdjoint:
             twisted = shape if kind.twist else (1, 1)
             self._islands = Islands(group.columns, real, device)
             self._islands.inertia_coefficient.fill_(1.0)
-            self._inertia = SimpleNamespace(
-                mass=device_arrays.allocate(shape, rod_layout.inertia_type(kind, real), device)
-            )
-            self._inertia.rotary, self._inertia.target_angle = (
-                device_arrays.allocate(twisted, real, device) for _ in range(2)
-            )
+            layouts = (shape, rod_layout.inertia_type(kind, real)), (twisted, real), (twisted, real)
+            self._inertia = [device_arrays.allocate(*layout, device) for layout in layouts]
         self._islands.inverse_step.fill_(rate)
-        self.resist(before, tangents, self._inertia, self._islands)
-        inertia = device_arrays.download(self._inertia.mass).T.ravel()
+        self.drag.resist(before, tangents, *self._inertia, self._islands)
+        inertia = device_arrays.download(self._inertia[0]).T.ravel()
         blocks = np.zeros((len(inertia), kind.block, kind.block))
         blocks[:, : kind.dim, : kind.dim] = inertia["resistance"].reshape(-1, kind.dim, kind.dim)
         if kind.twist:

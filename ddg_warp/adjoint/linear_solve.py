@@ -1,5 +1,6 @@
 """Linear systems of adjoints: the transposed exact Hessian of a solve, without any projection to SPD."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -182,7 +183,7 @@ class DirectSolve:
         few = automatic(group) == "cyclic_reduction"
         if not few and not kind.closed and linear is None:
             self.solver, self.system = None, RodNewton(*arguments)
-            self._moved = self.system.x, self.system.theta  # arrays that the sweep moves along w
+            self._moved = self.system.iterates  # with arrays that the sweep moves along w
             self.failed = self.system.islands.status
             return
         self.system = AssembledNewton(*arguments, stored=linear)
@@ -209,21 +210,22 @@ class DirectSolve:
 
     def __call__(self, solved, last: wp.array, rate: float, coefficient: float, rhs: wp.array, w: wp.array, resisted):
         """Write w; launches only. Arguments as of `RodLinearSolve`, `coefficient` that of inertia [1/s^2]."""
-        system = self.system
-        system.x, system.theta, system.frame = solved.x, solved.theta, solved.frame
+        system, loading = self.system, self.system.loading
+        system.iterates = replace(system.iterates, x=solved.x, theta=solved.theta, frame=solved.frame)
         islands = system.islands
         islands.arrays[0].zero_()
         islands.inertia_coefficient.fill_(coefficient)
         islands.inverse_step.fill_(rate)
         islands.not_converged.fill_(1)  # assemble the matrices of all rods
         if resisted:
-            resisted[0].resist(*resisted[1:], system, islands)
+            adjoint, *states = resisted
+            adjoint.drag.resist(*states, loading.mass, loading.rotary, system.iterates.target_angle, islands)
         system.evaluate(last)
         if self.solver is None:
             islands.frames_outdated.zero_()  # keep the frames of the step
-            (system.x, system.theta), system.rhs, system.direction = self._moved, rhs, w
-            device_arrays.copy(system.x, solved.x)
-            device_arrays.copy(system.theta, solved.theta)
+            system.iterates, system.rhs, system.direction = self._moved, rhs, w
+            device_arrays.copy(system.iterates.x, solved.x)
+            device_arrays.copy(system.iterates.theta, solved.theta)
             system.eliminate()
             return
         system.assemble_blocks()
@@ -231,15 +233,16 @@ class DirectSolve:
             self._solve(rhs, w)
             return
         nodes, count = w.shape[1:], self.group.count
-        self._launch(self._guess, nodes, [rhs, system.mass, islands.inertia_coefficient], [w])
+        self._launch(self._guess, nodes, [rhs, loading.mass, islands.inertia_coefficient], [w])
         for done in range(self.passes):
-            self._launch(self._product, nodes, [system.factor, system.geometric, w, count], [self._elements])
+            read = [system.elements.factor, system.elements.geometric, w, count]
+            self._launch(self._product, nodes, read, [self._elements])
             read = [
                 rhs,
                 w,
                 self._elements,
-                system.mass,
-                system.rotary,
+                loading.mass,
+                loading.rotary,
                 islands.inertia_coefficient,
                 self.group.fixed,
                 count,

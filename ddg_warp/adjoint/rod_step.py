@@ -159,12 +159,11 @@ class RodStepAdjoint:
 
     def keep(self, step, before: RodGroupState) -> SavedStep:
         """Return the saved data of the last step of a `RodStep`; `before` must stay unchanged."""
-        newton, twist = step.newton, self.group.kind.twist
-        theta, frame = (wp.clone(newton.theta), wp.clone(newton.frame)) if twist else (newton.theta, newton.frame)
-        islands = step.islands
-        return SavedStep(
-            before, wp.clone(newton.x), theta, frame, wp.clone(islands.substep_fraction), wp.clone(islands.retries)
-        )
+        iterates, islands = step.newton.iterates, step.islands
+        x, theta, frame = wp.clone(iterates.x), iterates.theta, iterates.frame
+        if self.group.kind.twist:
+            theta, frame = wp.clone(theta), wp.clone(frame)
+        return SavedStep(before, x, theta, frame, wp.clone(islands.substep_fraction), wp.clone(islands.retries))
 
     def vjp(self, kept: SavedStep, after: RodGroupState, cotangent: RodGroupState, s: float, states=None) -> tuple:
         """Return gradients by a step's start and inputs; the next call overwrites both. Launches only, except for

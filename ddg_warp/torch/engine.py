@@ -161,7 +161,8 @@ class Engine:
             if coupled:
                 frames = (part._lagged[0], self.before.coupled.frame) if part.coupled.edges else ()
             else:
-                frames = (part.newton.frame, self.before.groups[part.index].frame) if part.group.kind.twist else ()
+                iterates, twist = part.newton.iterates, part.group.kind.twist
+                frames = (iterates.frame, self.before.groups[part.index].frame) if twist else ()
             if frames and predictor and predictor.carries:
                 frames = frames[0], predictor.frame
             if coupled:

@@ -54,13 +54,13 @@ class Problem:
         newton = self.newton = RodNewton(self.model, self.group, NewtonOptions(**options))
         state = self.model.state().groups[0]
         x = device_arrays.download(state.x)
-        device_arrays.assign(newton.x, x + noise * random.normal(size=x.shape))
-        device_arrays.assign(newton.target, x + noise * random.normal(size=x.shape))
+        device_arrays.assign(newton.iterates.x, x + noise * random.normal(size=x.shape))
+        device_arrays.assign(newton.iterates.target, x + noise * random.normal(size=x.shape))
         if self.kind.twist:
-            shape = newton.theta.shape
-            wp.copy(newton.frame, state.frame)
-            device_arrays.assign(newton.theta, 2.0 * noise * random.normal(size=shape))
-            device_arrays.assign(newton.target_angle, 2.0 * noise * random.normal(size=shape))
+            shape = newton.iterates.theta.shape
+            wp.copy(newton.iterates.frame, state.frame)
+            device_arrays.assign(newton.iterates.theta, 2.0 * noise * random.normal(size=shape))
+            device_arrays.assign(newton.iterates.target_angle, 2.0 * noise * random.normal(size=shape))
         newton.islands.inertia_coefficient.assign(inertia * random.uniform(0.5, 1.5, size=4))
         newton.islands.inverse_step.fill_(1.0)
         newton.islands.drop_compression.fill_(
@@ -77,20 +77,20 @@ class Problem:
         return np.concatenate([q, device_arrays.download(angle).T[..., None]], -1) if self.kind.twist else q
 
     def iterate_dofs(self) -> np.ndarray:
-        return self.dofs(self.newton.x, self.newton.theta)
+        return self.dofs(self.newton.iterates.x, self.newton.iterates.theta)
 
     def put(self, q) -> None:
         """Make q the iterate."""
-        device_arrays.assign(self.newton.x, np.ascontiguousarray(np.moveaxis(q[..., : self.kind.dim], 0, 1)))
+        device_arrays.assign(self.newton.iterates.x, np.ascontiguousarray(np.moveaxis(q[..., : self.kind.dim], 0, 1)))
         if self.kind.twist:
-            device_arrays.assign(self.newton.theta, np.ascontiguousarray(q[..., self.kind.dim].T))
+            device_arrays.assign(self.newton.iterates.theta, np.ascontiguousarray(q[..., self.kind.dim].T))
 
     def direction(self) -> np.ndarray:
         return device_arrays.download(self.newton.direction).transpose(2, 1, 0)
 
     def age(self, q: np.ndarray, column: int):
         """Return cosines to lagged tangents, twist less lagged twist, and cosines of bends of a rod at q (n, dofs)."""
-        n, frame = self.count[column], device_arrays.download(self.newton.frame)[:, :, column]
+        n, frame = self.count[column], device_arrays.download(self.newton.iterates.frame)[:, :, column]
         t, (u0, t0) = polyline.unit(np.diff(q[:n, :3], axis=0)), (frame[row : row + 3, : n - 1].T for row in (0, 3))
         u = polyline.transport(u0, t0, t)
         twist = polyline.signed_angle(polyline.transport(u[:-1], t[:-1], t[1:]), u[1:], t[1:]) - frame[6, : n - 2]
@@ -122,7 +122,7 @@ class Problem:
         if kind.twist:
             diagonal[:, kind.dim] = c * host.rotary[:n, rod]
             force[:, kind.dim] = device_arrays.download(self.group.load_angle)[:n, rod]
-        target = self.dofs(self.newton.target, self.newton.target_angle)[column, :n]
+        target = self.dofs(self.newton.iterates.target, self.newton.iterates.target_angle)[column, :n]
         return diagonal.ravel(), target.ravel(), force.ravel()
 
     def free(self, column: int) -> np.ndarray:
@@ -132,7 +132,10 @@ class Problem:
     def dense(self, column: int, q: np.ndarray):
         """Return Gauss-Newton matrix and residual of a rod at q, from the output of the evaluate kernel."""
         kind, n = self.kind, self.count[column]
-        F, g = device_arrays.download(self.newton.factor), device_arrays.download(self.newton.gradient)
+        F, g = (
+            device_arrays.download(self.newton.elements.factor),
+            device_arrays.download(self.newton.elements.gradient),
+        )
         diagonal, target, force = self.inertia(column)
         H, r = np.diag(diagonal), force - diagonal * (q - target)
         edge_row, tension_row = kind.vertex_strains * kind.window, kind.factor_rows - kind.tensions
@@ -158,7 +161,7 @@ class Problem:
             wp.launch(
                 element_path.term_kernels(rod_storage(kind, real), i, real)[0],
                 (group.elements, group.columns),
-                [group.element_inputs(newton, self.last, newton.islands.inverse_step)],
+                [group.element_inputs(newton.iterates, self.last, newton.islands.inverse_step)],
                 [device_arrays.columns(out)],
                 device=self.device,
             )

@@ -53,11 +53,11 @@ def solvers(name, device, clamped, precision="float64", rounding_error=0.15, **o
     for group, state in zip(model.groups, model.state().groups, strict=True):
         newton = RodNewtonParallel(model, group, NewtonOptions())
         x = device_arrays.download(state.x)
-        for array in (newton.x, newton.target):
+        for array in (newton.iterates.x, newton.iterates.target):
             device_arrays.assign(array, x + rounding_error * random.normal(size=x.shape))
         if group.kind.twist:
-            wp.copy(newton.frame, state.frame)
-            for array in (newton.theta, newton.target_angle):
+            wp.copy(newton.iterates.frame, state.frame)
+            for array in (newton.iterates.theta, newton.iterates.target_angle):
                 device_arrays.assign(array, 2.0 * rounding_error * random.normal(size=array.shape))
         newton.islands.inertia_coefficient.assign(random.uniform(1.0, 3.0, size=group.columns))
         newton.islands.inverse_step.fill_(1.0)
@@ -123,11 +123,11 @@ def test_indefinite_matrices_lose_pivots(device):
     outcomes = set()
     for newton, state in solvers("untwisted", device, clamped=False, rounding_error=0.25):
         newton.islands.inertia_coefficient.fill_(0.3)
-        before = device_arrays.download(newton.x)
+        before = device_arrays.download(newton.iterates.x)
         newton.iterate(state.last)
         clamped, moved = (
             newton.islands.drop_compression.numpy(),
-            np.abs(device_arrays.download(newton.x) - before).max(axis=(0, 2)),
+            np.abs(device_arrays.download(newton.iterates.x) - before).max(axis=(0, 2)),
         )
         for column in range(newton.group.columns):
             indefinite = np.linalg.eigvalsh(dense(newton, column)[0])[0] < 0.0
@@ -145,7 +145,10 @@ def test_indefinite_matrices_lose_pivots(device):
 def adjust_serially(newton, todo: int):
     """Return `x`, `theta` and `frame` after the same iterate action by the serial kernel."""
     group = newton.group
-    copies = [wp.clone(array) for array in (newton.x, newton.theta, newton.frame, newton.base)]
+    copies = [
+        wp.clone(array)
+        for array in (newton.iterates.x, newton.iterates.theta, newton.iterates.frame, newton.iterates.base)
+    ]
     newton.islands.iterate_action.fill_(todo)
     wp.launch(
         rod_iterate.adjust_kernel(group.kind, newton.real, newton.linear),
@@ -171,10 +174,10 @@ def test_edge_rotations_match_serial_kernel(device, name, supported):
         newton.islands.step_length.fill_(0.7)
         newton.islands.angle_step_left.fill_(-0.3)
         expected = adjust_serially(newton, rod_iterate.ROTATE_EDGES)
-        straight = device_arrays.download(newton.base) + 0.7 * np.moveaxis(step[: group.kind.dim], 0, -1)
+        straight = device_arrays.download(newton.iterates.base) + 0.7 * np.moveaxis(step[: group.kind.dim], 0, -1)
         newton.move()
         inside = np.arange(group.nodes)[:, None] < np.tile(group.host.count, 2)
-        x, theta = device_arrays.download(newton.x), device_arrays.download(newton.theta)
+        x, theta = device_arrays.download(newton.iterates.x), device_arrays.download(newton.iterates.theta)
         np.testing.assert_allclose(x[inside], expected[0][inside], rtol=0, atol=1e-12)
         assert np.abs(x - straight)[inside].max() > 0.05
         if group.kind.twist:
@@ -186,14 +189,14 @@ def test_frame_updates_match_serial_kernel(device):
         if newton.group.kind.twist:
             newton.evaluate(state.last)
             before, (x, _, expected) = (
-                device_arrays.download(newton.frame),
+                device_arrays.download(newton.iterates.frame),
                 adjust_serially(newton, rod_iterate.UPDATE_FRAMES),
             )
             newton.move()
-            frames = device_arrays.download(newton.frame)
+            frames = device_arrays.download(newton.iterates.frame)
             np.testing.assert_allclose(frames, expected, rtol=0, atol=1e-13)
             assert np.abs(frames - before).max() > 0.1
-            np.testing.assert_array_equal(device_arrays.download(newton.x), x)
+            np.testing.assert_array_equal(device_arrays.download(newton.iterates.x), x)
 
 
 def advance(scene, device, linear, *, dt=0.01, steps=10, precision="float64", start=None, **options):

@@ -97,10 +97,10 @@ def deflected_helix(solver, device, psd: str):
     newton = solver(model, group, NewtonOptions(psd=psd, rtol=1e-13))
     data = model.state().groups[0]
     x = device_arrays.download(data.x)
-    wp.copy(newton.frame, data.frame)
-    device_arrays.assign(newton.x, x)
-    device_arrays.assign(newton.target, x + 0.2 * s[:, None, None] ** 2 * np.array([1.0, 0.5, 0.7]))
-    device_arrays.assign(newton.target_angle, np.ascontiguousarray(s[:, None]))
+    wp.copy(newton.iterates.frame, data.frame)
+    device_arrays.assign(newton.iterates.x, x)
+    device_arrays.assign(newton.iterates.target, x + 0.2 * s[:, None, None] ** 2 * np.array([1.0, 0.5, 0.7]))
+    device_arrays.assign(newton.iterates.target_angle, np.ascontiguousarray(s[:, None]))
     newton.islands.inertia_coefficient.fill_(500.0)
     newton.islands.any_active.fill_(1)
     return newton, data.last

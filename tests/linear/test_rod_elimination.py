@@ -61,38 +61,47 @@ class Problem:
         newton = self.newton = EliminationNewton(self.model, self.group, NewtonOptions(**options))
         state = self.model.state().groups[0]
         x = device_arrays.download(state.x)
-        device_arrays.assign(newton.x, scale * x + 0.1 * random.normal(size=x.shape))
-        device_arrays.assign(newton.target, x + 0.1 * random.normal(size=x.shape))
+        device_arrays.assign(newton.iterates.x, scale * x + 0.1 * random.normal(size=x.shape))
+        device_arrays.assign(newton.iterates.target, x + 0.1 * random.normal(size=x.shape))
         if self.kind.twist:
-            wp.copy(newton.frame, state.frame)
-            device_arrays.assign(newton.theta, 0.2 * random.normal(size=newton.theta.shape))
-            device_arrays.assign(newton.target_angle, 0.2 * random.normal(size=newton.theta.shape))
+            wp.copy(newton.iterates.frame, state.frame)
+            device_arrays.assign(newton.iterates.theta, 0.2 * random.normal(size=newton.iterates.theta.shape))
+            device_arrays.assign(newton.iterates.target_angle, 0.2 * random.normal(size=newton.iterates.theta.shape))
         newton.islands.inertia_coefficient.assign(random.uniform(1.0, 3.0, size=4))
         newton.islands.inverse_step.fill_(1.0)
         self.before = self.dofs()
         newton.iterate(state.last)
 
     def dofs(self) -> np.ndarray:
-        q = np.moveaxis(device_arrays.download(self.newton.x), 0, 1)
-        return np.concatenate([q, device_arrays.download(self.newton.theta).T[..., None]], -1) if self.kind.twist else q
+        q = np.moveaxis(device_arrays.download(self.newton.iterates.x), 0, 1)
+        return (
+            np.concatenate([q, device_arrays.download(self.newton.iterates.theta).T[..., None]], -1)
+            if self.kind.twist
+            else q
+        )
 
     def dense(self, column: int):
         """Return matrix (identity on fixed dofs), residual (zero there) and free mask, from element factors and gradients."""
         kind, host, n = self.kind, self.group.host, int(self.count[column])
-        F, g = (device_arrays.download(a)[:, :, column] for a in (self.newton.factor, self.newton.gradient))
+        F, g = (
+            device_arrays.download(a)[:, :, column]
+            for a in (self.newton.elements.factor, self.newton.elements.gradient)
+        )
         c, rod = float(device_arrays.download(self.newton.islands.inertia_coefficient)[column]), column % 2
         diagonal, force = np.zeros((n, kind.block)), np.zeros((n, kind.block))
         diagonal[:, : kind.dim] = c * host.mass[:n, rod, None]
         force[:, : kind.dim] = (
             host.mass[:n, rod, None] * self.group.gravity_host + device_arrays.download(self.group.load)[:n, rod]
         )
-        target = np.moveaxis(device_arrays.download(self.newton.target), 0, 1)[column, :n]
+        target = np.moveaxis(device_arrays.download(self.newton.iterates.target), 0, 1)[column, :n]
         if kind.twist:
             diagonal[:, kind.dim], force[:, kind.dim] = (
                 c * host.rotary[:n, rod],
                 device_arrays.download(self.group.load_angle)[:n, rod],
             )
-            target = np.concatenate([target, device_arrays.download(self.newton.target_angle).T[column, :n, None]], -1)
+            target = np.concatenate(
+                [target, device_arrays.download(self.newton.iterates.target_angle).T[column, :n, None]], -1
+            )
         H, r = np.diag(diagonal.ravel()), (force - diagonal * (self.before[column, :n] - target)).ravel()
         edge_row, tension_row = kind.vertex_strains * kind.window, kind.factor_rows - kind.tensions
         for k in range(n if kind.closed else n - 1):

@@ -68,15 +68,15 @@ def directions(
             size = np.linalg.norm(np.diff(x, axis=0), axis=-1, keepdims=True)
             edges *= size / np.maximum(np.linalg.norm(edges, axis=-1, keepdims=True), 1e-300)
             iterate[1:] = iterate[0] + np.cumsum(edges, axis=0)
-        device_arrays.assign(newton.x, iterate)
-        device_arrays.assign(newton.target, x)
+        device_arrays.assign(newton.iterates.x, iterate)
+        device_arrays.assign(newton.iterates.target, x)
         if group.kind.twist:
-            wp.copy(newton.frame, state.frame)
+            wp.copy(newton.iterates.frame, state.frame)
         newton.islands.inertia_coefficient.fill_(2.0 if psd == "gauss_newton" else 100.0)
         newton.islands.inverse_step.fill_(1.0)
         if carried is not None:
             newton.islands.max_edge_stiffness.fill_(carried)
-        edges = np.diff(device_arrays.download(newton.x), axis=0)
+        edges = np.diff(device_arrays.download(newton.iterates.x), axis=0)
         for _ in range(2):  # a second one for rods with an indefinite matrix under compression
             newton.iterate(state.last)
             if newton.islands.iteration.numpy().all():
@@ -147,9 +147,9 @@ def mixed_wavy_rod(nodes: int, axial: float, device) -> RodNewtonParallel:
     model = scene.build(device, "mixed")
     group, state = model.groups[0], model.state().groups[0]
     newton = RodNewtonParallel(model, group, NewtonOptions(), mixed_axial=True)
-    for array in (newton.x, newton.target):
+    for array in (newton.iterates.x, newton.iterates.target):
         wp.copy(array, state.x)
-    wp.copy(newton.frame, state.frame)
+    wp.copy(newton.iterates.frame, state.frame)
     newton.islands.inertia_coefficient.fill_(2.5e5)
     newton.islands.inverse_step.fill_(500.0)
     newton.islands.max_edge_stiffness.fill_(2e5)
@@ -163,7 +163,7 @@ def dense(newton: RodNewtonParallel) -> tuple[np.ndarray, np.ndarray]:
     kind, n = newton.group.kind, newton.group.nodes
     nb = kind.block
     blocks = device_arrays.download(newton.blocks)[..., 0].astype(float).reshape(3, nb, nb, n)
-    factor = device_arrays.download(newton.factor)[..., 0].astype(float)
+    factor = device_arrays.download(newton.elements.factor)[..., 0].astype(float)
     fixed = (device_arrays.download(newton.group.fixed)[:, :1] >> np.arange(nb)) & 1
     slack, H, rows = factor[-1, :-1], np.zeros((n, nb, n, nb)), np.zeros((n - 1, n, nb))
     for k in range(n):

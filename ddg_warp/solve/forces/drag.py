@@ -1,7 +1,5 @@
 """Drag on uncoupled and coupled rods in a flowing fluid; see `kernels.forces.drag`."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import warp as wp
 
@@ -52,37 +50,33 @@ class RodGroupDrag(Drag):
     def __init__(self, model, group, midpoint: bool = False):
         super().__init__(model, group, drag.rod_kernels(group.kind, model.types.real), midpoint)
 
-    def resist(self, before, newton, islands) -> None:
-        """Write inertia and drag of a solve from the state `before`, after the predictor."""
+    def resist(self, before, x: wp.array, mass: wp.array, rotary: wp.array, target_angle: wp.array, islands) -> None:
+        """Write inertia and drag, with target angles, of a solve from the state `before`, given the predictor x."""
         group = self.part
         self._launch(
             self._resist,
             group.node_threads,
-            [before.x, before.v, before.theta, newton.x if self.midpoint else before.x, newton.x, group.drag, self.flow]
+            [before.x, before.v, before.theta, x if self.midpoint else before.x, x, group.drag, self.flow]
             + [group.mass, group.rotary, group.count, *islands.arrays],
-            [newton.mass, newton.rotary, newton.target_angle],
+            [mass, rotary, target_angle],
         )
 
     def at(self, data, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Return inertia and drag (node, column) of a state at t over a second, and the flow (dim,)."""
         group, real, device = self.part, self.model.types.real, self.model.wp_device
-        solve = SimpleNamespace(x=data.x)
-        solve.mass = device_arrays.allocate(
-            (group.nodes, group.columns), rod_layout.inertia_type(group.kind, real), device
-        )
-        solve.rotary, solve.target_angle = wp.zeros_like(data.theta), wp.clone(data.theta)
+        mass = device_arrays.allocate((group.nodes, group.columns), rod_layout.inertia_type(group.kind, real), device)
         self.upload(t, t)
-        self.resist(data, solve, self._over_a_second())
-        return device_arrays.download(solve.mass), self.flow.numpy()[0].astype(float)
+        self.resist(data, data.x, mass, wp.zeros_like(data.theta), wp.clone(data.theta), self._over_a_second())
+        return device_arrays.download(mass), self.flow.numpy()[0].astype(float)
 
-    def settle(self, before, after, newton, islands) -> None:
+    def settle(self, before, after, iterates, islands) -> None:
         """Write the rates of massless dofs of the state `after`, which may be `before` itself."""
         group = self.part
         if self.midpoint:
             self._launch(
                 self._settle,
                 group.node_threads,
-                [newton.x, newton.theta, group.mass, group.rotary, group.count, *islands.arrays]
+                [iterates.x, iterates.theta, group.mass, group.rotary, group.count, *islands.arrays]
                 + [after.x, after.theta, before.v, before.omega],
                 [after.v, after.omega, after.a, after.alpha],
             )

@@ -1,6 +1,6 @@
 """Projected Newton on rod groups; every rod has its own loop, line search and outcome, all on the device."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import warp as wp
 
@@ -13,6 +13,7 @@ from ddg_warp.kernels.newton import rod_iterate
 from ddg_warp.kernels.newton import rod_sweep as sweep
 from ddg_warp.kernels.residual import rod_residual
 from ddg_warp.kernels.stepping import rod_step, warm_start
+from ddg_warp.solve.newton.rod_state import RodElements, RodIterates, RodLoading, RodResidualNorms
 from ddg_warp.timers import timer
 
 FIRST_EXACT_ITERATION = 2  # Gauss-Newton iterations of "progressive": far from a solution the exact matrix is no better
@@ -84,11 +85,8 @@ class RodNewton:
             `kernels.linear.mixed_axial_force`.
 
     Attributes:
-        x, theta, frame: the iterate and its lagged frames.
-        base: the accepted positions before the update.
-        target: minimum of the inertial potential, coefficient * m |x - target|^2 / 2; for twist angles `target_angle`.
-        mass: m, and `rotary`; own arrays with drag, which `kernels.forces.drag` writes at the start of a solve.
-        load: forces on nodes, and moments about edges `load_angle`, if `loaded`.
+        iterates, loading, elements, norms: state of a solve; see `ddg_warp.solve.newton.rod_state`.
+        rhs, direction: right-hand side and solution of the linear system (rows, nodes, columns).
         islands: state of every rod's line search; see `kernels.core.islands`.
     """
 
@@ -101,35 +99,18 @@ class RodNewton:
         self.real, self.linear = model.types.real, linear or model.types.linear
         self.eps = model.types.eps
         kind, device = group.kind, model.wp_device
-        vector = wp.types.vector(kind.dim, self.real)
-        nodes, columns = (group.nodes, group.columns), group.columns
-
-        def make(*shape, dtype=self.real):
-            return device_arrays.allocate(shape, dtype, device)
-
-        twisted = nodes if kind.twist else (1, 1)
-        self.x, self.base, self.target = (make(*nodes, dtype=vector) for _ in range(3))
-        self.theta, self.target_angle = make(*twisted), make(*twisted)
-        self.frame = make(7, *twisted)
-        self.load, self.load_angle, self.loaded = group.load, group.load_angle, group.host.loaded
-        self.mass, self.rotary = group.mass, group.rotary
-        if kind.drag:
-            self.mass = make(*nodes, dtype=rod_layout.inertia_type(kind, self.real))
-            self.rotary = make(*twisted)
-        self.factor = make(kind.factor_rows + mixed_axial, *nodes, dtype=self.linear)
-        self.gradient = make(kind.window, *nodes)
-        self.energy = make(2, *nodes)
-        self.stiffness = make(*nodes, dtype=self.linear)
+        self.iterates = RodIterates.of(group, self.real)
+        self.loading = RodLoading.of(group, self.iterates)
+        self.norms = RodResidualNorms.of(group, self.real, self.linear)
         self.rhs, self.direction = (
-            make(rows, *nodes, dtype=self.linear) for rows in (kind.block, kind.block + mixed_axial)
+            device_arrays.allocate((rows, group.nodes, group.columns), self.linear, device)
+            for rows in (kind.block, kind.block + mixed_axial)
         )
-        self.energy_change, self.energy_noise = make(*nodes), make(*nodes, dtype=self.linear)
-        self.islands = Islands(columns, self.real, device)
+        self.islands = Islands(group.columns, self.real, device)
         self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
         self.exact = self.psd != "gauss_newton" and kind.span == 2  # a rod that only stretches has its Hessian anyway
-        rows = kind.geometric_rows if self.exact else 1
         self.exact_from = (FIRST_EXACT_ITERATION if self.psd == "progressive" else 0) if self.exact else None
-        self.geometric = make(rows, *(nodes if self.exact else (1, 1)), dtype=self.linear)
+        self.elements = RodElements.of(group, self.real, self.linear, self.exact, mixed_axial)
         self._project = None
         if self.psd == "project" and self.exact:
             self._project = geometric_stiffness.project_kernel(kind, self.real, self.linear)
@@ -143,16 +124,7 @@ class RodNewton:
             self.definite,
             self.reuse,
         )
-        self._results = element_path.results_type(self.real, self.linear)()
-        self._results.factor = self._results.tension = device_arrays.columns(self.factor)
-        self._results.second, self._results.gradient = (
-            device_arrays.columns(self.geometric),
-            device_arrays.columns(self.gradient),
-        )
-        self._results.energy, self._results.stiffness = (
-            device_arrays.columns(self.energy),
-            device_arrays.columns(self.stiffness),
-        )
+        self._results = self.elements.results()
         self._check = rod_residual.check_kernel(kind, self.real, self.linear)
         self._predict = rod_step.predict_kernel(kind, self.real, self.linear, midpoint)
         self._further = None if midpoint else warm_start.further_kernel(kind, self.real, self.linear)
@@ -200,8 +172,9 @@ class RodNewton:
 
     def take_loads(self) -> None:
         """Allocate loads on all nodes and angles, in place of the group's constant ones."""
-        self.load, self.loaded = device_arrays.allocate(self.x.shape, self.x.dtype, self.device), True
-        self.load_angle = device_arrays.allocate(self.theta.shape, self.real, self.device)
+        x, theta = self.iterates.x, self.iterates.theta
+        force, moment = (device_arrays.allocate(array.shape, array.dtype, self.device) for array in (x, theta))
+        self.loading = replace(self.loading, force=force, moment=moment, loaded=True)
 
     def predict(self, before) -> None:
         """Recompute the predictor of bent rods from the state `before` by rotating edges; carry frames to midpoints."""
@@ -209,7 +182,7 @@ class RodNewton:
             self._predict,
             self.group.columns,
             [before.x, before.v, self.group.fixed, self.group.anchor, self.group.count, *self.islands.arrays],
-            [self.base, self.direction, self.x, self.frame],
+            [self.iterates.base, self.direction, self.iterates.x, self.iterates.frame],
             device=self.device,
         )
 
@@ -220,7 +193,7 @@ class RodNewton:
             self._further,
             group.columns,
             [before.x, group.fixed, group.anchor, group.count, *self.islands.arrays, predicted, self.direction],
-            [self.x],
+            [self.iterates.x],
             device=self.device,
         )
 
@@ -238,11 +211,12 @@ class RodNewton:
     @timer("evaluate")
     def evaluate(self, last: wp.array) -> None:
         """Evaluate energies, gradients and Gauss-Newton factors of all elements at the iterate."""
-        group = self.group
+        group, islands = self.group, self.islands
+        inputs = group.element_inputs(self.iterates, last, islands.inverse_step)
         wp.launch(
             self._evaluate,
             group.element_threads,
-            [group.element_inputs(self, last, self.islands.inverse_step), *self.islands.arrays, self.exact_from or 0],
+            [inputs, *islands.arrays, self.exact_from or 0],
             [self._results],
             device=self.device,
             block_dim=128,
@@ -251,8 +225,8 @@ class RodNewton:
             wp.launch(
                 self._project,
                 (group.elements, group.columns),
-                [self.x, group.count, self.islands.status, group.kind.window, self.factor],
-                [self.geometric],
+                [self.iterates.x, group.count, islands.status, group.kind.window, self.elements.factor],
+                [self.elements.geometric],
                 device=self.device,
             )
 
@@ -260,14 +234,16 @@ class RodNewton:
     def check(self) -> None:
         """Compute residuals, the change of the energy, and the rods that are out of equilibrium."""
         group, options = self.group, self.options
+        iterates, loading, elements = self.iterates, self.loading, self.elements
         wp.launch(
             self._check,
             group.node_threads,
-            [self.gradient, self.energy, self.stiffness, group.count, self.mass, self.rotary, *self.islands.arrays]
-            + [self.x, self.theta, self.base, self.direction, self.target, self.target_angle]
-            + [group.gravity, self.load, self.load_angle, int(self.loaded), group.fixed, group.length]
+            [elements.gradient, elements.energy, elements.stiffness, group.count]
+            + [loading.mass, loading.rotary, *self.islands.arrays]
+            + [iterates.x, iterates.theta, iterates.base, self.direction, iterates.target, iterates.target_angle]
+            + [group.gravity, loading.force, loading.moment, int(loading.loaded), group.fixed, group.length]
             + [options.rtol, options.floor_factor * self.eps],
-            [self.rhs, self.energy_change, self.energy_noise],
+            [self.rhs, self.norms.change, self.norms.rounding_error],
             device=self.device,
         )
 
@@ -284,7 +260,7 @@ class RodNewton:
             self._adjust,
             group.columns,
             [group.count, group.fixed, group.anchor, self.direction, *self.islands.arrays],
-            [self.x, self.theta, self.frame, self.base],
+            [self.iterates.x, self.iterates.theta, self.iterates.frame, self.iterates.base],
             device=self.device,
         )
 
@@ -295,11 +271,12 @@ class RodNewton:
         wp.launch(
             self._sweep,
             group.columns,
-            [self.factor, self.geometric, self.rhs, self.energy_change, self.energy_noise, group.count]
-            + [self.mass, self.rotary, *self.islands.arrays, group.fixed]
+            [self.elements.factor, self.elements.geometric]
+            + [self.rhs, self.norms.change, self.norms.rounding_error, group.count]
+            + [self.loading.mass, self.loading.rotary, *self.islands.arrays, group.fixed]
             + [options.floor_factor * self.eps, options.rotation_cap]
             + [options.max_iterations, options.max_halvings]
-            + [self.x, self.theta, self.base, self.elimination, self.direction],
+            + [self.iterates.x, self.iterates.theta, self.iterates.base, self.elimination, self.direction],
             device=self.device,
             block_dim=self._threads,
         )

@@ -70,8 +70,8 @@ class AssembledNewton(RodNewton):
         wp.launch(
             self._assemble,
             (-(-group.columns // rod_matrix.TILE), group.nodes, min(rod_matrix.TILE, group.columns)),
-            [self.factor, self.geometric, group.count, self.mass, self.rotary, group.fixed, *self.islands.arrays]
-            + [int(self.reuse)],
+            [self.elements.factor, self.elements.geometric, group.count, self.loading.mass, self.loading.rotary]
+            + [group.fixed, *self.islands.arrays, int(self.reuse)],
             [self.blocks],
             device=self.device,
         )
@@ -83,7 +83,8 @@ class AssembledNewton(RodNewton):
         self._launch(
             self._weigh,
             self.ranges,
-            [self.rhs, self.energy_change, self.energy_noise, self.group.count, self.islands.status, self.ranges],
+            [self.rhs, self.norms.change, self.norms.rounding_error]
+            + [self.group.count, self.islands.status, self.ranges],
             [self.partial],
         )
         wp.launch(
@@ -101,8 +102,8 @@ class AssembledNewton(RodNewton):
         self._launch(
             self._gauge,
             self.ranges,
-            [self.rhs, self.direction, self.x, group.count, self.islands.needs_direction, self.ranges],
-            [self.base, self.partial],
+            [self.rhs, self.direction, self.iterates.x, group.count, self.islands.needs_direction, self.ranges],
+            [self.iterates.base, self.partial],
         )
         wp.launch(
             self._take,

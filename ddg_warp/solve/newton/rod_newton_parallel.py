@@ -32,7 +32,7 @@ class RodNewtonParallel(AssembledNewton):
         self.prefix = device_arrays.allocate((group.nodes, columns), vector, device)
         self.mean = wp.zeros(columns, dtype=vector, device=device)
         self.held = device_arrays.upload(_fixed_neighbours(group), int, device)
-        self.new_frame = device_arrays.allocate(self.frame.shape, real, device)
+        self.new_frame = device_arrays.allocate(self.iterates.frame.shape, real, device)
         if mixed_axial:
             self.reduction = TensionReduction(group, real, self.linear, device)
         else:
@@ -57,8 +57,8 @@ class RodNewtonParallel(AssembledNewton):
         self._launch(
             self._aim,
             group.nodes,
-            [before.x, before.v, group.fixed, group.count, *self.islands.arrays, self.x],
-            [self.base, self.direction],
+            [before.x, before.v, group.fixed, group.count, *self.islands.arrays, self.iterates.x],
+            [self.iterates.base, self.direction],
         )
         self.move(0 if self.midpoint else REPEAT_ROTATION)
         if self.midpoint and group.kind.twist:
@@ -75,7 +75,7 @@ class RodNewtonParallel(AssembledNewton):
         """Compute directions by cyclic reduction."""
         islands = self.islands
         if self.mixed_axial:
-            self.reduction.solve(self.blocks, self.factor, self.rhs, self.x, islands, self.direction)
+            self.reduction.solve(self.blocks, self.elements.factor, self.rhs, self.iterates.x, islands, self.direction)
         else:
             self.reduction.solve(
                 self.blocks, self.rhs, self.group.count, islands.needs_direction, self.direction, islands.lost_pivots
@@ -91,13 +91,13 @@ class RodNewtonParallel(AssembledNewton):
             base: start of the step, `base` by default.
             now: see `rod_iterate_parallel.move_kernels`.
         """
-        base = self.base if base is None else base
+        iterates, base = self.iterates, self.iterates.base if base is None else base
         group, islands, (turn, scan, offset, move) = self.group, self.islands, self._moves
         self._launch(
             turn if onward is None else self._turn_ahead,
             group.nodes,
             [group.count, islands.iterate_action, self.direction, islands.step_length, islands.straight_rotation_limit]
-            + [onward or 0, base, base if now is None else now, self.x, self.frame],
+            + [onward or 0, base, base if now is None else now, iterates.x, iterates.frame],
             [self.prefix, self.new_frame],
         )
         self._launch(scan, self.ranges, [group.count, islands.iterate_action, self.width, self.prefix], [self.sums])
@@ -113,7 +113,7 @@ class RodNewtonParallel(AssembledNewton):
             group.nodes,
             [group.count, group.fixed, self.held, *islands.arrays, self.direction]
             + [self.prefix, self.sums, self.mean, self.width, self.new_frame],
-            [self.x, self.theta, self.frame, base],
+            [iterates.x, iterates.theta, iterates.frame, base],
         )
 
 

@@ -101,7 +101,7 @@ class RodEnergy(_Energy):
         group, newton = step.group, step.newton
         self.ranges = 1 if group.kind.serial else max(1, math.isqrt(group.nodes))
         super().__init__(step, group.columns, 2 * self.ranges, kept)
-        self._loads = [newton.load, newton.load_angle]
+        self._loads = [newton.loading.force, newton.loading.moment]
         self._follows = bool(group.host.followers)
         if self._follows:
             self._loads = [wp.clone(load) for load in self._loads]
@@ -113,23 +113,24 @@ class RodEnergy(_Energy):
     def check_drift(self, before, start) -> None:
         """Test the energy drift of the step from the state `before`, with the lagged data of `start`."""
         step, group, newton = self.step, self.step.group, self.step.newton
+        iterates, loading = newton.iterates, newton.loading
         if self._follows:
-            step.loads.apply(newton.x, *self._loads)
+            step.loads.apply(iterates.x, *self._loads)
         grid, common, scalars = (
             (self.ranges, group.columns),
             [self.rounding_factor, self.ranges],
             step.islands.arrays[1],
         )
-        states = [group.element_inputs(state, start.last, step.islands.inverse_step) for state in (before, newton)]
-        read = [*states, device_arrays.columns(newton.stiffness), scalars, *common]
+        states = [group.element_inputs(state, start.last, step.islands.inverse_step) for state in (before, iterates)]
+        read = [*states, device_arrays.columns(newton.elements.stiffness), scalars, *common]
         self._launch(self._elements[0], grid, read, [self.rows[:, : self.ranges]])
-        read = [group.node_state(before), newton.x, newton.theta, group.mass, group.rotary]
+        read = [group.node_state(before), iterates.x, iterates.theta, group.mass, group.rotary]
         read += [
-            newton.mass if group.kind.drag else None,
+            loading.mass if group.kind.drag else None,
             group.count,
             *self._loads,
-            newton.load,
-            newton.load_angle,
+            loading.force,
+            loading.moment,
             int(self._follows),
         ]
         self._launch(self._nodes, grid, [*read, scalars, step.damping, *common], [self.rows[:, self.ranges :]])

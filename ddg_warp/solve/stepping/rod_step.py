@@ -39,8 +39,10 @@ class RodStep(StepDriver):
         kind, real = group.kind, model.types.real
         self._begin = time_step.begin_kernel(kind.nodes, real, self.midpoint)
         self._foresee = warm_start.warm_start_kernel(kind.nodes, real, self.newton.linear)
-        predicted = ((array.shape, array.dtype, model.wp_device) for array in (self.newton.x, self.newton.theta))
-        self._predicted, self._predicted_angle = (device_arrays.allocate(*layout) for layout in predicted)
+        x, theta = self.newton.iterates.x, self.newton.iterates.theta
+        self._predicted, self._predicted_angle = (
+            device_arrays.allocate(array.shape, array.dtype, model.wp_device) for array in (x, theta)
+        )
         self._nodes = time_step.finish_kernel(kind.nodes, real, self.midpoint)
         self._frames = rod_step.finish_frames_kernel(kind, real) if kind.twist else None
         self.outer = group.outer
@@ -61,27 +63,29 @@ class RodStep(StepDriver):
 
     def predict(self, before):
         """Launch the predictor, with supports at their prescribed positions; return `before`, whose data the solve lags."""
-        group, newton = self.group, self.newton
+        group, newton, iterates = self.group, self.newton, self.newton.iterates
         self._launch(
             self._begin,
             group.node_threads,
             [group.node_state(before), before.frame, group.fixed, group.count, group.world]
             + [self.integrator._dt, self.damping, self.outer, *self.islands.arrays],
-            [newton.x, newton.theta, newton.frame, None, newton.target, newton.target_angle],
+            [iterates.x, iterates.theta, iterates.frame, None, iterates.target, iterates.target_angle],
         )
         if self.motion:
-            self.motion.place(self.islands, newton.x)
+            self.motion.place(self.islands, iterates.x)
         newton.predict(before)
         if self.motion:
-            self.motion.direct(self.islands, newton.x, newton.frame, newton.theta)
+            self.motion.direct(self.islands, iterates.x, iterates.frame, iterates.theta)
         return before
 
     def apply_loads(self, before) -> None:
         """Launch the loads in time, and drag."""
+        iterates, loading = self.newton.iterates, self.newton.loading
         if self.loads:
-            self.loads.apply(self.newton.x, self.newton.load, self.newton.load_angle)
+            self.loads.apply(iterates.x, loading.force, loading.moment)
         if self.drag:
-            self.drag.resist(before, self.newton, self.islands)
+            outputs = loading.mass, loading.rotary, iterates.target_angle
+            self.drag.resist(before, iterates.x, *outputs, self.islands)
 
     def warm_start(self, before) -> None:
         """Warm-start from the predictor by the last correction, and store the start."""
@@ -90,7 +94,7 @@ class RodStep(StepDriver):
             self._foresee,
             group.node_threads,
             [before.a, before.alpha, group.fixed, group.count, *self.islands.arrays],
-            [newton.x, newton.theta, self._predicted, self._predicted_angle, newton.direction],
+            [newton.iterates.x, newton.iterates.theta, self._predicted, self._predicted_angle, newton.direction],
         )
         newton.go_further(before, self._predicted)
 
@@ -101,25 +105,25 @@ class RodStep(StepDriver):
 
     def finish(self, before, after) -> None:
         """Launch positions and rates at the end of accepted substeps."""
-        group, newton = self.group, self.newton
+        group, iterates = self.group, self.newton.iterates
         self._launch(
             self._nodes,
             group.node_threads,
-            [newton.x, newton.theta, group.node_state(before), before.a, before.alpha]
+            [iterates.x, iterates.theta, group.node_state(before), before.a, before.alpha]
             + [self._predicted, self._predicted_angle, None, None, group.count, *self.islands.arrays],
             [group.node_state(after), after.a, after.alpha, None],
         )
         if self.drag:
-            self.drag.settle(before, after, newton, self.islands)
+            self.drag.settle(before, after, iterates, self.islands)
 
     def complete(self, start, before, after) -> None:
         """Update frames and strains to the positions."""
-        group, newton = self.group, self.newton
+        group, iterates = self.group, self.newton.iterates
         if self._frames:
             self._launch(
                 self._frames,
                 group.element_threads,
-                [after.x, newton.frame, before.frame, group.count, self.islands.substep_accepted],
+                [after.x, iterates.frame, before.frame, group.count, self.islands.substep_accepted],
                 [after.frame],
             )
         if group.kind.viscous:
