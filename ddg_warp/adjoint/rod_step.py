@@ -65,6 +65,25 @@ class RodInputs:
     drag: wp.array | None = None
 
 
+@dataclass
+class RodCotangents:
+    """Gradients by intermediate results of a step of a rod group (rows, n, R).
+
+    Attributes:
+        window, lag: by the local dofs and by the lagged frames of elements.
+        end: by the end positions, through frames and strains there.
+        solution: by the solution of the solve; rhs: right-hand side of its adjoint system.
+        frame: by the frames of the end state, through strains too.
+    """
+
+    window: wp.array
+    lag: wp.array
+    end: wp.array
+    solution: wp.array
+    rhs: wp.array
+    frame: wp.array
+
+
 class RodStepAdjoint:
     """Reverse of the steps and equilibria of a rod group.
 
@@ -109,9 +128,9 @@ class RodStepAdjoint:
         self._damping = wp.array([model.scene.mass_damping], dtype=real, device=device)
         self.gravity = wp.array(np.tile(group.gravity_host, (group.worlds, 1)), dtype=self.vector, device=device)
         twisted = kind.twist
-        self._window, self._lag = self._rows(kind.window), self._rows(13)
-        self._end, self._dof, self._right = (self._rows(kind.block) for _ in range(3))
-        self._by_frame = self._rows(7, twisted and viscous)
+        self._cotangents = RodCotangents(
+            *map(self._rows, (kind.window, 13, *3 * (kind.block,))), self._rows(7, twisted and viscous)
+        )
         self._start_state = RodGroupState(
             x=self._make(self.vector),
             v=self._make(self.vector),
@@ -127,7 +146,7 @@ class RodStepAdjoint:
             mass=self._make(),
             rotary=self._make(),
             load=self._rows(kind.block),
-            held=self._dof,
+            held=self._cotangents.solution,
             rate=self._make(),
             damping=self._make(),
             gravity=self._make(self.vector),
@@ -179,7 +198,8 @@ class RodStepAdjoint:
             Gradients by the start, a `RodGroupState`, and `RodInputs`.
         """
         group, kind, before = self.group, self.group.kind, kept.before
-        start, inputs, window, lag = self._start_state, self._inputs, self._window, self._lag
+        start, inputs, cotangents = self._start_state, self._inputs, self._cotangents
+        window, lag, by_solution = cotangents.window, cotangents.lag, cotangents.solution
         self._rate.fill_(1.0 / s)
         by_frame, lagged = (
             cotangent.frame,
@@ -197,19 +217,19 @@ class RodStepAdjoint:
             for kernel in self._strain:
                 self._launch(kernel, read, [*map(device_arrays.columns, (window, lag, inputs.parameters))])
             if kind.twist:
-                by_frame = self._by_frame
+                by_frame = cotangents.frame
                 device_arrays.copy(by_frame, cotangent.frame)
                 self._launch(self._edges, [lag, group.count], [by_frame])
         if kind.twist:
             self._launch(self._frame, [after.x, kept.frame, group.count, by_frame], [window, lagged])
         if kind.twist or kind.viscous:
-            self._launch(self._ends, [window, group.count], [self._end])
+            self._launch(self._ends, [window, group.count], [cotangents.end])
         end, out, began = map(group.node_state, (cotangent, start, before))
         masses = [group.mass, group.rotary]
-        read = [end, self._end, group.fixed, *masses, None, group.count, group.nodes, self._rate]
-        self._launch(self._solution, read, [self._dof, self._right])
+        read = [end, cotangents.end, group.fixed, *masses, None, group.count, group.nodes, self._rate]
+        self._launch(self._solution, read, [by_solution, cotangents.rhs])
         resisted = self.drag and (self.drag, before, tangents)
-        self.solve(kept, before.last, s, self._right, inputs.load, resisted)
+        self.solve(kept, before.last, s, cotangents.rhs, inputs.load, resisted)
         read = [kept.x, kept.theta, began, inputs.load, *masses, group.count, group.nodes, group.nodes]
         read += [self._rate, self._damping, self.gravity, group.world]
         written = [out, inputs.mass, inputs.rotary, inputs.rate, inputs.damping, inputs.gravity, None]
@@ -218,25 +238,25 @@ class RodStepAdjoint:
         written = [*map(device_arrays.columns, (window, lag, inputs.parameters, start.last, inputs.rate))]
         for kernel in self._vjp:
             self._launch(kernel, read, written)
-        self._launch(self._nodes, [window, group.count], [self._dof])
+        self._launch(self._nodes, [window, group.count], [by_solution])
         if self.solve.held is not None:
-            device_arrays.assign(self._dof, device_arrays.download(self._dof) + self.solve.held)
+            device_arrays.assign(by_solution, device_arrays.download(by_solution) + self.solve.held)
         if kind.twist:
             self._launch(self._edges, [lag, group.count], [lagged])
         if self.supports and kind.twist:
-            force = self._dof[: kind.dim], self._dof[kind.dim]
+            force = by_solution[: kind.dim], by_solution[kind.dim]
             self.supports.follow(*states)
             self.supports.vjp(kept.x, kept.frame, *force, lagged)
         if self.drag:
             by_tangents = predictor.by_x if self._midpoint else None
-            read = before, tangents, kept, inputs.load, self._rate, self._dof, start, inputs.rate
+            read = before, tangents, kept, inputs.load, self._rate, by_solution, start, inputs.rate
             self.drag.vjp(*read, by_tangents)
         if self.followers:
             w = inputs.load[: kind.dim], inputs.load[kind.dim] if kind.twist else None
             self.followers.vjp(predictor.x, *w, predictor.by_x[: kind.dim])
         if predictor:
-            predictor.vjp(before, self._nodes, window, self._dof, start, inputs.rate)
-        read = [end, self._end, kept.x, kept.theta, began, self._dof, self._leaves, *masses, None, group.count]
+            predictor.vjp(before, self._nodes, window, by_solution, start, inputs.rate)
+        read = [end, cotangents.end, kept.x, kept.theta, began, by_solution, self._leaves, *masses, None, group.count]
         self._launch(self._start, [*read, group.nodes, self._rate], [out, inputs.rate])
         return start, inputs
 
