@@ -76,6 +76,29 @@ class CoupledInputs:
     radius: wp.array | None = None
 
 
+@dataclass
+class CoupledCotangents:
+    """Gradients by intermediate results of a step of the coupled system, and w of its adjoint system.
+
+    Attributes:
+        end: by the end positions, through frames and strains there (W N,).
+        q: by the solution of the solve (W N,); lagged: by the one at a friction lag.
+        w: solution of the adjoint system (W N,).
+        stays: entries of `q` of fixed dofs without prescribed motion (W N,).
+        end_frame: by the frames of the end state.
+        frames, own_rows: by the frames (2) and own lagged rows (3) of the end state, of the solve, and of the start state.
+    """
+
+    end: wp.array
+    q: wp.array
+    w: wp.array
+    stays: wp.array
+    lagged: wp.array | None
+    end_frame: wp.array
+    frames: list[wp.array]
+    own_rows: list[list[wp.array]]
+
+
 class CoupledStepAdjoint:
     """Reverse of the steps and equilibria of a model's coupled system; `gravity` and `axes`: see `RodStepAdjoint`.
 
@@ -123,12 +146,15 @@ class CoupledStepAdjoint:
         def of_sets(rows):
             return [self._shares.make(rows(part.term), part.elements) for part in coupled.sets]
 
-        self._by_end, self._by_q, self._w, self._end, self._stays = (make() for _ in range(5))
-        self._by_lagged = make() if self.contact and self.contact.friction_iterations > 1 else None
-        self._given_frame = self._shares.make(FRAME, coupled.edges)
-        # gradients by frames and own lagged rows: of the end state, of the solve, and of the start state
-        self._by_frame = [self._shares.make(FRAME, coupled.edges) for _ in range(2)]
-        self._by_own = [self._shares.make_own() for _ in range(3)]
+        self._end = make()
+        end_frame, *frames = (self._shares.make(FRAME, coupled.edges) for _ in range(3))
+        self._cotangents = CoupledCotangents(
+            *(make() for _ in range(4)),
+            make() if self.contact and self.contact.friction_iterations > 1 else None,
+            end_frame,
+            frames,
+            [self._shares.make_own() for _ in range(3)],
+        )
         self._start_state = coupled.empty()
         self._inputs = CoupledInputs(
             parameters=of_sets(lambda term: len(term.parameter_names)),
@@ -136,7 +162,7 @@ class CoupledStepAdjoint:
             end_data=of_sets(lambda term: term.measure.data_size),
             mass=make(),
             load=make(),
-            held=self._by_q,
+            held=self._cotangents.q,
             rate=make(real),
             damping=make(real),
             gravity=make(),
@@ -204,10 +230,11 @@ class CoupledStepAdjoint:
         """
         coupled, solved, before, shares = self.coupled, kept.solved, kept.before, self._shares
         rate, last = 1.0 / s, coupled.blocks - coupled.host.spins
-        start, inputs, by_end, grad_q, w = self._start_state, self._inputs, self._by_end, self._by_q, self._w
+        start, inputs, cotangents = self._start_state, self._inputs, self._cotangents
+        by_end, grad_q, w = cotangents.end, cotangents.q, cotangents.w
         self._clear()
-        frame, carried = self._given_frame, self._by_frame[0]
-        of_end, own_rows, first = self._by_own
+        frame, (carried, carried_first) = cotangents.end_frame, cotangents.frames
+        of_end, own_rows, first = cotangents.own_rows
         wp.copy(frame, cotangent.frame)
         # strains of the end state, the reference of the next step's damping
         for i, kernel in enumerate(self._strains):
@@ -266,14 +293,14 @@ class CoupledStepAdjoint:
             if self.contact:
                 by_lagged = next(
                     gradient
-                    for source, gradient in ((before.q, start.q), (q, grad_q), (lag_q, self._by_lagged))
+                    for source, gradient in ((before.q, start.q), (q, grad_q), (lag_q, cotangents.lagged))
                     if source is lag_q
                 )
                 self.contact.vjp((lag_q, before.q, q), w, self._friction_rate, (by_lagged, start.q, grad_q))
                 if kept.friction_rate:
                     self.contact.roll(q, before.q, start.q, grad_q)
             if lag_q is not before.q and lag_q is not q:
-                self.solve.vjp_by_lagged(self._by_lagged, grad_q)
+                self.solve.vjp_by_lagged(cotangents.lagged, grad_q)
         if self.solve.held is not None:
             wp.map(wp.add, grad_q, self.solve.held, out=grad_q)
         if self.supports:
@@ -286,14 +313,14 @@ class CoupledStepAdjoint:
             self.followers.vjp(coupled.points(lagged.q), *gradients)
         if predictor:
             if predictor.carries:
-                written = by_predicted, inputs.data, self._by_frame[1], first
+                written = by_predicted, inputs.data, carried_first, first
                 shares.uncarry(before, lagged, lagged.q, carried, own_rows, *written)
-                carried, own_rows = self._by_frame[1], first
+                carried, own_rows = carried_first, first
             predictor.vjp(before, grad_q, start, inputs.rate)
         start.frame, start.lag = carried, own_rows
         if s < np.inf:
-            self.solve.stays(grad_q, self._stays)
-        read = [end, more, points(solved.q), None, began, components(self._stays), self._leaves, *masses]
+            self.solve.stays(grad_q, cotangents.stays)
+        read = [end, more, points(solved.q), None, began, components(cotangents.stays), self._leaves, *masses]
         read += [self._resisted, coupled.count, last, self._rates]
         self._launch(self._start, grid, read, [out, points(inputs.rate)])
         return start, inputs
@@ -307,10 +334,10 @@ class CoupledStepAdjoint:
 
     def _clear(self) -> None:
         """Zero the accumulated gradients."""
-        inputs, start = self._inputs, self._start_state
-        own_rows = [array for arrays in self._by_own for array in arrays]
+        inputs, start, cotangents = self._inputs, self._start_state, self._cotangents
+        own_rows = [array for arrays in cotangents.own_rows for array in arrays]
         for array in (
-            *(self._by_end, start.q, start.v, *start.last, *self._by_frame, *own_rows),
+            *(cotangents.end, start.q, start.v, *start.last, *cotangents.frames, *own_rows),
             *(inputs.load, inputs.mass, inputs.rate, inputs.damping, inputs.gravity, *inputs.elements_rate),
             *(*inputs.parameters, *inputs.data, *inputs.end_data),
             *([inputs.drag] if self.drag else []),
