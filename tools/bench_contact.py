@@ -111,7 +111,7 @@ def measure(edges: int, device, repeats: int) -> dict:
     """Return a row of the table."""
     shapes, points = strands(edges)
     x = wp.array(points, dtype=wp.vec3d, device=device)
-    search = BroadPhase(shapes, x, reach=REACH, margin=MARGIN)
+    search = BroadPhase(shapes, x, search_distance=REACH, margin=MARGIN)
     device_arrays.load_kernels(search.kernels, device)
     pairs = search.lists[0]
     number, number_of_pairs = pairs.first.count, int(pairs.count.numpy()[0])

@@ -199,7 +199,7 @@ class BroadPhase:
             num_ccd_bodies: number of CCD bodies of a world.
 
         Raises:
-            SceneError: not 0 <= keep <= 1, or arrays are invalid.
+            SceneError: not 0 <= min_separation_fraction <= 1, or arrays are invalid.
         """
         _checked_keep(min_separation_fraction)
         self._filter.check(ccd_body, together, num_ccd_bodies)
@@ -275,7 +275,7 @@ class BroadPhase:
         The time is conservative, 1 without such a pair and 0 if some overlap at x. All pairs are tested, not only candidates.
 
         Raises:
-            SceneError: not 0 <= keep <= 1.
+            SceneError: not 0 <= min_separation_fraction <= 1.
         """
         _checked_keep(min_separation_fraction)
         self.time.fill_(1.0)
