@@ -189,4 +189,4 @@ def test_no_scene_is_left_out():
 @pytest.mark.parametrize("name", ["capstan", "cloth_on_sphere", "cloth_twist", "flag_on_pole", "rod_pile"])
 def test_scenes_build_without_friction(name):
     """A slip speed, which has no effect without friction, would be refused."""
-    assert load_scene(name).build(friction=0.0).contact_parameters.friction == 0.0
+    assert load_scene(name).build(friction=0.0).contact_settings.friction == 0.0
