@@ -363,7 +363,9 @@ def test_decoupling_is_not_built_where_it_does_not_apply(device, scene, options,
         raise AssertionError("made")
 
     monkeypatch.setattr(DecoupledStep, "__init__", refuse)
-    run(device, scene(), 2, **options)
+    _, integrator, decoupled = run(device, scene(), 2, **options)
+    assert not decoupled.any()
+    assert integrator._coupled is None or integrator._coupled.decoupled is None
 
 
 def test_steps_with_controls_are_coupled(device):
