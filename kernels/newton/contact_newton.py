@@ -326,7 +326,7 @@ def pending_kernels(real, linear, serial: bool):
     `land`: put supports at the end of a full step.
     `arrive`: put supports at prescribed positions, or mark the world as moving.
     `part`: discard proposed motions that have ended.
-    `way`: write the remainder of a proposed motion.
+    `remainder`: write the remainder of a proposed motion.
     `push`: write the remaining motion of supports into the direction.
     `lessen`: subtract a product from the residual.
     `add`: add that remainder to the direction.
@@ -414,7 +414,7 @@ def pending_kernels(real, linear, serial: bool):
                 proposed[k + w * blocks] = q[k + w * blocks]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def way(
+    def remainder(
         q: wp.array(dtype=V),
         proposed: wp.array(dtype=V),
         wanted: wp.array(dtype=int),
@@ -469,4 +469,4 @@ def pending_kernels(real, linear, serial: bool):
             for k in range(start, until(start, blocks)):
                 direction[k + w * blocks] += remainder[k + w * blocks]
 
-    return aim, depart, land, arrive, part, way, push, lessen, add
+    return aim, depart, land, arrive, part, remainder, push, lessen, add

@@ -40,7 +40,7 @@ STALLED = 8  # allowed iterations without progress if energy changes are below t
 
 
 @cache
-def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contact: bool = False, crowd: bool = False):
+def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contact: bool = False, relaxed: bool = False):
     """Build the kernels of the line search and of updates.
 
     `decide_action`: test convergence, accept or shorten an update, and set the forcing term.
@@ -51,7 +51,7 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
 
     `turns`: True if there are rods, so that edges may rotate. `renews`: True if there are frames to update.
     `contact`: True if supports may be moving; see `kernels.newton.contact_newton`.
-    `crowd`: True for relaxed convergence; see `ddg_warp.solve.newton.relaxed_convergence`.
+    `relaxed`: True for relaxed convergence; see `ddg_warp.solve.newton.relaxed_convergence`.
     """
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     balanced, decide = line_search_functions(renews, real, contact)
@@ -141,7 +141,7 @@ def search_kernels(real, linear, serial: bool, turns: bool, renews: bool, contac
             enough = rtol * scalars[LOAD_SCALE, w] / worst[w]
             till = spare * enough >= eta
             limit[w] = tightest
-            if wp.static(crowd):
+            if wp.static(relaxed):
                 if flags[CCD_LIMITED, w] == 0:
                     till = True
                     limit[w] = wp.where(first, real(wp.static(FIRST)), eta)

@@ -88,16 +88,17 @@ def edge_functions(dim: int, real):
 
 @cache
 def repeat_rotation_function(real):
-    """Return the device function `onward(straight, wanted)`: `wanted`, but `REPEAT_ROTATION` only for rods that always rotate edges.
+    """Return the device function `continuation(straight, wanted)`: `wanted`, but `REPEAT_ROTATION` only for rods that always rotate
+    edges.
 
     Soft rods lengthen as they move.
     """
 
     @wp.func
-    def onward(straight: real, wanted: int):
+    def continuation(straight: real, wanted: int):
         return wp.where(straight == real(0.0) or wanted != wp.static(REPEAT_ROTATION), wanted, 0)
 
-    return onward
+    return continuation
 
 
 @cache

@@ -140,13 +140,13 @@ def search_functions(kind: RodKind, real, linear, mixed_axial: bool = False):
         count: int
         closed: int
         anchor: int
-        onward: int
+        continuation: int
         r: int
 
     @wp.func
     def excess_at(rod: Rod, j: int):
         node = along(j, rod.count)
-        return excess(rod.base, rod.now, rod.direction, rod.amount, rod.onward, node, rod.count, rod.r)
+        return excess(rod.base, rod.now, rod.direction, rod.amount, rod.continuation, node, rod.count, rod.r)
 
     @wp.func
     def anchored(rod: Rod, j: int):
@@ -187,7 +187,7 @@ def search_functions(kind: RodKind, real, linear, mixed_axial: bool = False):
         rod.count = n
         rod.closed = wp.static(int(closed))
         rod.anchor = anchor[r]
-        rod.onward = extrapolation
+        rod.continuation = extrapolation
         rod.r = r
         place_rod(rod)
 

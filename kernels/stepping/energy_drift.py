@@ -221,13 +221,13 @@ def node_kernel(nodes: NodeStorage, real, drag: bool):
 def drift_kernel(real):
     """Build the kernel that accumulates the energy balance of every rod or world.
 
-    `judge`: add a solved step to the account, or fail the step. The account holds the total drift and its rounding bound, the
+    `record`: add a solved step to the account, or fail the step. The account holds the total drift and its rounding bound, the
     largest kinetic plus elastic energy, and the total dissipation. A step fails if the total drift exceeds the fraction `bound` of
     that energy plus dissipation, and grows.
     """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def judge(
+    def record(
         rows: wp.array3d(dtype=real),
         bound: real,
         flags: wp.array2d(dtype=int),
@@ -260,4 +260,4 @@ def drift_kernel(real):
         account[wp.static(ENERGY), r] = energy
         account[wp.static(DISSIPATED), r] = dissipated
 
-    return judge
+    return record

@@ -155,7 +155,7 @@ def finish_kernel(nodes: NodeStorage, real, midpoint: bool, contact: bool = Fals
     `finish`: write positions, twist angles, velocities and accelerations at the end of the substep of islands that converged.
 
     In the coupled system `trust` scales accelerations, and the rate of inertia in contact is stored if `rate_out` has entries.
-    `contact`: see `crowd` of `extrapolation_rate_function`.
+    `contact`: see `extrapolation_rate_function`.
     """
     coupled, extrapolation_of = nodes.coupled, extrapolation_rate_function(real, midpoint, contact)
     V, State, (dofs, store) = wp.types.vector(nodes.dim, real), state_type(nodes, real), dof_functions(nodes, real)

@@ -45,11 +45,11 @@ def extrapolation_step_function(real):
 
 
 @cache
-def extrapolation_rate_function(real, midpoint: bool, crowd: bool = False):
+def extrapolation_rate_function(real, midpoint: bool, contact: bool = False):
     """Return the device function `told(flags, scalars, i)`: squared rate that makes a correction an acceleration.
 
     Zero where corrections are not extrapolated: with the midpoint rule, after a cold start, or after so many iterations that the
-    motion does not continue. In a `crowd` many iterations indicate contacts, and `kernels.stepping.coupled_warm_start` decides instead.
+    motion does not continue. In `contact` many iterations indicate contacts, and `kernels.stepping.coupled_warm_start` decides instead.
     """
 
     @wp.func
@@ -57,7 +57,7 @@ def extrapolation_rate_function(real, midpoint: bool, crowd: bool = False):
         valid = (
             wp.static(not midpoint)
             and flags[COLD_START, i] == 0
-            and (wp.static(crowd) or flags[ITERATION, i] <= wp.static(MAX_WARM_START_ITERATIONS))
+            and (wp.static(contact) or flags[ITERATION, i] <= wp.static(MAX_WARM_START_ITERATIONS))
         )
         return wp.where(valid, scalars[INVERSE_STEP, i] * scalars[INVERSE_STEP, i], real(0.0))
 

@@ -362,7 +362,7 @@ POINTS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0,
         ),
         (
             lambda s: BroadPhase(s, wp.zeros(5, dtype=wp.vec3d, device="cpu"), search_distance=0.0, margin=1.0),
-            "reach = 0.0",
+            "search_distance = 0.0",
         ),
     ],
 )

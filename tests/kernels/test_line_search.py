@@ -24,7 +24,7 @@ CASES = {  # name -> change of the energy [J], predicted decrease [J], squared r
 
 def decided(device, backtracks: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Return flags and scalars after the decision on an iterate of each case, a rod each."""
-    judge, _ = decide_kernels(RodKind(3, False, False, ()), wp.float64, False)
+    decide_action, _ = decide_kernels(RodKind(3, False, False, ()), wp.float64, False)
     change, predicted, square, _ = np.array(list(CASES.values()), float).T
     flags = np.zeros((len(islands.FLAGS), len(CASES)), np.int32)
     scalars = np.zeros((len(islands.SCALARS), len(CASES)))
@@ -35,7 +35,7 @@ def decided(device, backtracks: int = 0) -> tuple[np.ndarray, np.ndarray]:
     sums = np.stack([change, np.full(len(CASES), ROUNDING), square, np.sqrt(square)])[:, None]
     flags = wp.array(flags, device=device)
     sums, scalars = (wp.array(values, dtype=wp.float64, device=device) for values in (sums, scalars))
-    wp.launch(judge, len(CASES), [sums, 1, 1.0, 9, MAX_BACKTRACKS, flags, scalars], device=device)
+    wp.launch(decide_action, len(CASES), [sums, 1, 1.0, 9, MAX_BACKTRACKS, flags, scalars], device=device)
     return flags.numpy(), scalars.numpy()
 
 

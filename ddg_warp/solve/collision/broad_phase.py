@@ -38,7 +38,7 @@ class BroadPhase:
     Args:
         shapes: collision mesh of one world.
         x: positions (worlds times nodes,), vectors of 3 [m], world by world.
-        search_distance: search distance: largest gap of interest [m], positive.
+        search_distance: largest gap of interest [m], positive.
         margin: skin margin added to the search distance [m], positive. Large ones give more pairs, small ones more searches.
         radius: radius of every object in every world (worlds, objects) [m], in place of the radii of `shapes`.
 
@@ -53,7 +53,7 @@ class BroadPhase:
         `version`: grows whenever arrays were reallocated, and graphs with these have to be captured again.
 
     Raises:
-        SceneError: x, reach or margin are invalid.
+        SceneError: x, search_distance or margin are invalid.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class BroadPhase:
         margin: float,
         radius: wp.array | None = None,
     ):
-        for name, value in (("reach", search_distance), ("margin", margin)):
+        for name, value in (("search_distance", search_distance), ("margin", margin)):
             if not 0.0 < value < np.inf:
                 raise SceneError(f"{name} = {value!r} of a contact search; it is positive and finite [m]")
         nodes = len(shapes.points)
@@ -74,12 +74,8 @@ class BroadPhase:
             raise SceneError(
                 f"positions of {worlds} world(s) of {nodes} nodes are {worlds * nodes} vectors of 3, not {x.shape} of {x.dtype}"
             )
-        self.shapes, self.worlds, self.search_distance, self.margin = (
-            shapes,
-            worlds,
-            float(search_distance),
-            float(margin),
-        )
+        self.shapes, self.worlds = shapes, worlds
+        self.search_distance, self.margin = float(search_distance), float(margin)
         self.device, real = x.device, x.dtype._wp_scalar_type_
         self.real = real
         if radius is None:
@@ -149,7 +145,7 @@ class BroadPhase:
         together = self._never if together is None else together
         validity = self.validity
 
-        def anew() -> None:
+        def search_again() -> None:
             if q is None:
                 self.search(base)
                 return
@@ -157,7 +153,7 @@ class BroadPhase:
 
         validity.done.zero_()
         validity.watch(base, base if q is None else q, validity.stale)
-        wp.capture_if(validity.stale, anew)
+        wp.capture_if(validity.stale, search_again)
 
     @timer("broad phase")
     def search(self, x: wp.array, move: wp.array | None = None, together: wp.array | None = None) -> None:
@@ -201,7 +197,7 @@ class BroadPhase:
         Raises:
             SceneError: not 0 <= min_separation_fraction <= 1, or arrays are invalid.
         """
-        _checked_keep(min_separation_fraction)
+        _check_fraction(min_separation_fraction)
         self._filter.check(ccd_body, together, num_ccd_bodies)
         self.update(base, q, together)
         self._filter(
@@ -277,7 +273,7 @@ class BroadPhase:
         Raises:
             SceneError: not 0 <= min_separation_fraction <= 1.
         """
-        _checked_keep(min_separation_fraction)
+        _check_fraction(min_separation_fraction)
         self.time.fill_(1.0)
         self._passing(
             self._impacts, x, move, min_separation_fraction, self._unused[1], [self._unused[2]] * len(self.lists)
@@ -359,6 +355,6 @@ class BroadPhase:
             primitives.enclose(x, move, self._shift, radius_fraction, margin, self.counters.lost)
 
 
-def _checked_keep(min_separation_fraction: float) -> None:
+def _check_fraction(min_separation_fraction: float) -> None:
     if not 0.0 <= min_separation_fraction <= 1.0:
         raise SceneError(f"min_separation_fraction = {min_separation_fraction!r} of the thickness; it is from 0 to 1")

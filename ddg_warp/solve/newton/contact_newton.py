@@ -38,7 +38,8 @@ class NewtonContact:
         bodies: body of each block of a world (blocks,), -1 for none; and the largest possible number of bodies.
         `bends`: True if the matrix has the geometric stiffness of pairs; see `kernels.collision.contact.geometric_stiffness`.
         `has_friction`: True with friction; rate: inverse time over which slips count (worlds,) [1/s].
-        solutions: positions of the last step at which friction was updated, in order, for the reverse pass: `lags` - 1 of (W N,).
+        solutions: positions of the last step at which friction was updated, in order, for the reverse pass: `friction_iterations` -
+            1 of (W N,).
     """
 
     def __init__(self, model, iterates, rate: wp.array, linear, psd: str):

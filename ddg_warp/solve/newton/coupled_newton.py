@@ -59,9 +59,8 @@ class CoupledNewton:
     """
 
     banded = True  # True if substructuring stores its blocks of H, which are valid on free dofs alone
-    keeps_levels = (
-        True  # True if the first multilevel preconditioner of a solve without contact serves all its matrices
-    )
+    # True if the first multilevel preconditioner of a solve without contact serves all its matrices
+    keeps_levels = True
 
     def __init__(
         self,

@@ -82,11 +82,11 @@ class RodNewtonParallel(AssembledNewton):
             )
 
     @timer("edge rotation")
-    def move(self, onward: int | None = None, base: wp.array | None = None, now: wp.array | None = None) -> None:
+    def move(self, continuation: int | None = None, base: wp.array | None = None, now: wp.array | None = None) -> None:
         """Apply the pending update of every rod: a step, straight or by rotating edges, or a frame update of the iterate.
 
         Args:
-            onward: continuation of a predictor's step, which has no tensions, see `kernels.newton.edge_rotation`; None for a step
+            continuation: continuation of a predictor's step, which has no tensions, see `kernels.newton.edge_rotation`; None for a step
                 of the solve.
             base: start of the step, `base` by default.
             now: see `rod_iterate_parallel.move_kernels`.
@@ -94,10 +94,10 @@ class RodNewtonParallel(AssembledNewton):
         iterates, base = self.iterates, self.iterates.base if base is None else base
         group, islands, (turn, scan, offset, move) = self.group, self.islands, self._moves
         self._launch(
-            turn if onward is None else self._turn_ahead,
+            turn if continuation is None else self._turn_ahead,
             group.nodes,
             [group.count, islands.iterate_action, self.direction, islands.step_length, islands.straight_rotation_limit]
-            + [onward or 0, base, base if now is None else now, iterates.x, iterates.frame],
+            + [continuation or 0, base, base if now is None else now, iterates.x, iterates.frame],
             [self.prefix, self.new_frame],
         )
         self._launch(scan, self.ranges, [group.count, islands.iterate_action, self.width, self.prefix], [self.sums])

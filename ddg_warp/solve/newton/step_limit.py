@@ -27,11 +27,8 @@ class StepLimit:
     """
 
     def __init__(self, model, touch, bodies: tuple[np.ndarray, int]):
-        self.coupled, self.search, self.min_separation_fraction = (
-            model.coupled,
-            touch.search,
-            touch.min_separation_fraction,
-        )
+        self.coupled, self.search = model.coupled, touch.search
+        self.min_separation_fraction = touch.min_separation_fraction
         real, device = self.coupled.real, self.coupled.device
         ccd_body, self._num_ccd_bodies = number_units(*bodies, self.coupled.host, model.motions)
         self._ccd_body = wp.array(ccd_body, dtype=int, device=device)

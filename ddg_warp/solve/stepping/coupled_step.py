@@ -166,7 +166,7 @@ class CoupledStep(StepDriver):
         self.newton.contact.tally.begin()
 
     def go_on(self, before, after) -> None:
-        """Step the worlds that `alone` left to the coupled system; finished worlds stay unchanged."""
+        """Step the worlds that `decoupled` left to the coupled system; finished worlds stay unchanged."""
         if self.coupled.worlds == 1:  # nothing is counted yet
             self._keep()
         else:
@@ -209,7 +209,7 @@ class CoupledStep(StepDriver):
 
     @property
     def _rods(self) -> list:
-        """Uncoupled steps of the rods; empty without `alone`."""
+        """Uncoupled steps of the rods; empty without `decoupled`."""
         return self.decoupled.rod_steps if self.decoupled else []
 
     def adapt(self, s: float, parameters_changed: bool = False) -> bool:

@@ -65,18 +65,18 @@ class _Energy:
         self.sums = make(rows, energy_drift.ROWS, count)
         self.rows = self.sums.transpose((1, 0, 2))
         self.rounding_factor = step.newton.options.floor_factor * self.model.types.eps
-        self._judge = energy_drift.drift_kernel(real)
+        self._record = energy_drift.drift_kernel(real)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [*self._elements, self._nodes, self._judge]
+        return [*self._elements, self._nodes, self._record]
 
     def _enter(self) -> None:
         """Update the energy balance, or mark steps as failed."""
         step = self.step
         self._launch(
-            self._judge,
+            self._record,
             self.account.shape[1],
             [self.rows, step.integrator.energy_bound, *step.islands.arrays],
             [self.account, self.failed],
@@ -116,11 +116,8 @@ class RodEnergy(_Energy):
         iterates, loading = newton.iterates, newton.loading
         if self._follows:
             step.loads.apply(iterates.x, *self._loads)
-        grid, common, scalars = (
-            (self.ranges, group.columns),
-            [self.rounding_factor, self.ranges],
-            step.islands.arrays[1],
-        )
+        grid, common = (self.ranges, group.columns), [self.rounding_factor, self.ranges]
+        scalars = step.islands.arrays[1]
         states = [group.element_inputs(state, start.last, step.islands.inverse_step) for state in (before, iterates)]
         read = [*states, device_arrays.columns(newton.elements.stiffness), scalars, *common]
         self._launch(self._elements[0], grid, read, [self.rows[:, : self.ranges]])

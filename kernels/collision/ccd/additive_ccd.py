@@ -19,7 +19,7 @@ from ddg_warp.kernels.core.launch import CPU_OPTIONS
 REST, NEAR = 0.1, 0.2  # remaining fraction of wide gaps; of narrow gaps, and of the search distance
 PARTS = 1000  # largest number of advances; the time reached by then is safe, too
 MAX_STEPS = 100_000  # largest number of advances of the crossing test
-BESIDE = 0.1  # clearance that proves a pair separate, over the search distance
+CLEARANCE = 0.1  # clearance that proves a pair separate, over the search distance
 IN_CONTACT = 1e-9  # distance at which a pair crosses, over its size
 
 
@@ -148,7 +148,7 @@ def passing_kernel(kind: Kind, real):
     """Build the kernel of the crossing test.
 
     `passing`: count the pairs of a list that cross or, with `min_separation_fraction`, whose distance falls below
-        `min_separation_fraction` of the thickness plus `BESIDE` of `search_distance` [m].
+        `min_separation_fraction` of the thickness plus `CLEARANCE` of `search_distance` [m].
     """
     Sides, X = sides_struct(real), wp.types.vector(3, real)
     pair_nodes, _, thickness, _ = pair_functions(kind, real)
@@ -172,7 +172,9 @@ def passing_kernel(kind: Kind, real):
             nodes = pair_nodes(sides, i, j, w)
             near = real(0.0)
             if min_separation_fraction > real(0.0):
-                near = min_separation_fraction * (thickness(sides, i, j, w) + real(wp.static(BESIDE)) * search_distance)
+                near = min_separation_fraction * (
+                    thickness(sides, i, j, w) + real(wp.static(CLEARANCE)) * search_distance
+                )
             if meet(corners(x, nodes), corners(move, nodes), near):
                 wp.atomic_add(number, w, 1)
 
