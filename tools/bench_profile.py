@@ -4,9 +4,9 @@
 
 Prints two tables; writes profile_DEVICE.csv, .json (a row a case) and profile_kernels_DEVICE.csv, .json (a row a kernel of a case).
 `ms` is the time of a step with captured graphs. Kernels are timed in the same steps without capture, by CUPTI on CUDA and by the
-clock of the host on the CPU. Columns `launches`, `us` of the device and `MB` are for a step. Bytes are the sizes of all arrays in the arguments
-of a launch, each once, however little a launch reads of them or however often. `floor_ms`: bytes over the bandwidth of a copy. Two
-processes measure a case, one with timers and one without, since timers are chosen at import.
+clock of the host on the CPU. Columns `launches`, `us` of the device and `MB` are for a step. Bytes are the sizes of all arrays in
+the arguments of a launch, each once, however little a launch reads of them or however often. `floor_ms`: bytes over the bandwidth of
+a copy. Two processes measure a case, one with timers and one without, since timers are chosen at import.
 """
 
 import argparse
