@@ -183,7 +183,7 @@ class DirectSolve:
         few = automatic(group) == "cyclic_reduction"
         if not few and not kind.closed and linear is None:
             self.solver, self.system = None, RodNewton(*arguments)
-            self._moved = self.system.iterates  # with arrays that the sweep moves along w
+            self._moved, self._residual = self.system.iterates, self.system.rhs  # the sweep moves the former along w
             self.failed = self.system.islands.status
             return
         self.system = AssembledNewton(*arguments, stored=linear)
@@ -220,6 +220,8 @@ class DirectSolve:
         if resisted:
             adjoint, *states = resisted
             adjoint.drag.resist(*states, loading.mass, loading.rotary, system.iterates.target_angle, islands)
+        if self.solver is None:
+            system.rhs = self._residual
         system.evaluate(last)
         if self.solver is None:
             islands.frames_outdated.zero_()  # keep the frames of the step

@@ -43,7 +43,7 @@ def rod_kernels(kind: RodKind, real, midpoint: bool):
     dim, twist, closed = kind.dim, kind.twist, kind.closed
     V, M, P = wp.types.vector(dim, real), wp.types.matrix((dim, dim), real), wp.types.vector(ROWS, real)
     half, resisted = edge_function(dim, real), resisted_function(dim, real)
-    _, previous, *_ = node_functions(kind, real)
+    previous, _ = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
     row, _ = row_functions(dim, real)
 

@@ -82,7 +82,7 @@ def gathered_function(kind: RodKind, real):
     """Return the device function `gathered(windows, k, n, r)`: sum of the element windows at the dofs of node k of n."""
     dim, twist, closed, window = kind.dim, kind.twist, kind.closed, kind.window
     B = wp.types.vector(kind.block, real)
-    _, previous, _, edge_force = node_functions(kind, real)
+    previous, edge_force = node_functions(kind, real)
 
     @wp.func
     def gathered(windows: wp.array3d(dtype=real), k: int, n: int, r: int):
@@ -115,7 +115,7 @@ def gather_kernels(kind: RodKind, real):
     data to frames of edges.
     """
     block, closed, gathered = kind.block, kind.closed, gathered_function(kind, real)
-    _, previous, *_ = node_functions(kind, real)
+    previous, _ = node_functions(kind, real)
 
     def gather_kernel(adds: bool):
         @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

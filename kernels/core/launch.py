@@ -78,3 +78,17 @@ def first_of(world: int, count: int):
 def wait():
     """Wait for all threads of the block, whose writes are then visible to each other."""
     ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    asm volatile("" : "+r"(i));
+#endif
+    return i;
+""")
+def renewed(i: int) -> int:
+    """Return an index that the CUDA compiler takes for a new one.
+
+    Addresses that depend on it alone stay in a loop, instead of in registers across all of the loop.
+    """
+    ...

@@ -20,7 +20,6 @@ from typing import Any
 import warp as wp
 
 from ddg_warp.kernels.core.islands import (
-    ANY_ACTIVE,
     DROP_COMPRESSION,
     ENERGY_BUFFER,
     FRAMES_OUTDATED,
@@ -75,8 +74,6 @@ class ElementStorage:
         slots: (f, local node) -> derivative with respect to a dof block; None if derivatives stay by the window.
         num_slots: number of dof blocks of an element, zero without `slots`.
         stiffness_dofs: number of leading dofs that measure the stiffness; None for all.
-        clears_active: True if the first thread of all clears the flag `any_active`.
-        launch_bounds: (curved) -> threads and blocks of the kernel of an iteration, None for the default.
     """
 
     terms: tuple[TermAccess, ...]
@@ -95,8 +92,6 @@ class ElementStorage:
     slots: Callable | None = None
     num_slots: int = 0
     stiffness_dofs: int | None = None
-    clears_active: bool = False
-    launch_bounds: Callable = lambda curved: None
 
 
 @cache
@@ -259,11 +254,13 @@ def drop_compression_function(real, tensions: int):
 
 
 @cache
-def evaluate_function(storage: ElementStorage, index: int, real, linear, curved: bool, mixed_axial: bool):
+def evaluate_function(
+    storage: ElementStorage, index: int, real, linear, curved: bool, mixed_axial: bool, writes_gradient: bool
+):
     """Return the device function `evaluate_at` of one term: write its factor, tensions and second derivatives.
 
-    It returns energy, derivative with respect to the window, and the largest stiffness of a strain. A term that is alone writes its
-    gradient itself and returns zero.
+    It returns energy, derivative with respect to the window, and the largest stiffness of a strain. A term that `writes_gradient`
+    returns zero derivatives.
     """
     access, Inputs, W, L = storage.terms[index], storage.Inputs, storage.Window, storage.Lagged
     Results, term, measure = results_type(real, linear, storage.slots is not None), access.term, access.term.measure
@@ -286,7 +283,7 @@ def evaluate_function(storage: ElementStorage, index: int, real, linear, curved:
     splits, bends = mixed_axial and tensions > 0, curved and curvature_of is not None
     drop_compression = drop_compression_function(real, tensions)
     left_out, carried_part = left_out_function(term, real), stiffness_split_function(real)
-    alone, write_gradient = len(storage.terms) == 1, write_function(storage, real, real)
+    write_gradient = write_function(storage, real, real)
     second_rows = access.second or tuple(range(measure.packed))
     where = wp.types.vector(max(1, len(second_rows)), int)(*(second_rows or (0,)))
 
@@ -310,7 +307,7 @@ def evaluate_function(storage: ElementStorage, index: int, real, linear, curved:
         slope = slope_of(strain, p)
         energy = w * energy_of(strain, p)
         f = spread((slope * w) * jacobian)
-        if wp.static(alone):  # frees its registers
+        if wp.static(writes_gradient):  # frees its registers
             write_gradient(results.gradient, 0, f, column)
             f = W()
         shift = E()
@@ -365,85 +362,112 @@ def evaluate_function(storage: ElementStorage, index: int, real, linear, curved:
 
 
 @cache
-def evaluate_kernel(
-    storage: ElementStorage,
-    real,
-    linear,
-    curved: bool = False,
-    mixed_axial: bool = False,
-    project: bool = False,
-    reuse: bool = False,
+def element_function(
+    storage: ElementStorage, real, linear, curved: bool, mixed_axial: bool, writes_gradient: bool = False
 ):
+    """Return the device function `element_at` of all terms: write factors, tensions and second derivatives of an element.
+
+    It returns energy, derivative with respect to the window, and the largest stiffness of a strain. Nothing is written of a `frozen`
+    element that is not `exact`. The flag `frames_outdated` is set where reference frames must be updated before the next step. With
+    `writes_gradient` the only term writes its gradient, and the derivative returned is zero.
+    """
+    Inputs, Results, W = storage.Inputs, results_type(real, linear, storage.slots is not None), storage.Window
+    whole_of, read = storage.whole, storage.read
+    measures = [access.term.measure for access in storage.terms]
+    # Alternatives: a loop over the terms, or a recursive function.
+    # Measured: for wp.static(each[i]) of a loop variable Warp generates all code of a kernel whenever it is defined, compiled or not,
+    # 0.3 s each. Recursion costs 5 % of a step on the CPU.
+    terms, everywhere = len(measures), measures[0].span == 1 or len(measures) == 1
+    first_term, last_term = (
+        evaluate_function(storage, index, real, linear, curved, mixed_axial, writes_gradient) for index in (0, -1)
+    )
+    stale = next((m.stale(real) for m in measures if m.stale), None)
+
+    @wp.func
+    def element_at(
+        inputs: Inputs,
+        flags: wp.array2d(dtype=int),
+        results: Results,
+        clamped: bool,
+        frozen: bool,
+        exact: bool,
+        carried: real,
+        island: int,
+        e: int,
+        column: int,
+    ):
+        whole = whole_of(inputs, island, e)
+        q, s = read(inputs, island, e, whole)
+        if wp.static(stale is not None):  # before the terms: after them, dofs would occupy 30 to 50 more registers
+            if whole and stale(q, s):
+                flags[FRAMES_OUTDATED, island] = 1
+        energy = real(0.0)
+        f = W()
+        stiffest = real(0.0)
+        if whole or wp.static(everywhere):
+            term_energy, part, stiff = first_term(
+                inputs, results, q, s, clamped, frozen, exact, carried, island, e, column
+            )
+            energy += term_energy
+            f += part
+            stiffest = wp.max(stiffest, stiff)
+        if wp.static(terms > 1):
+            energy_too, part_too, stiff_too = last_term(
+                inputs, results, q, s, clamped, frozen, exact, carried, island, e, column
+            )
+            energy += energy_too
+            f += part_too
+            stiffest = wp.max(stiffest, stiff_too)
+        return energy, f, stiffest
+
+    return element_at
+
+
+def element_options(storage: ElementStorage, curved: bool) -> dict:
+    """Return the module options of a kernel that calls `element_function`, which unrolls second derivatives."""
+    packed = max(access.term.measure.packed for access in storage.terms) if curved else 0
+    return CPU_OPTIONS | {"max_unroll": packed} if packed else CPU_OPTIONS
+
+
+@cache
+def evaluate_kernel(storage: ElementStorage, real, linear, curved: bool = False, mixed_axial: bool = False):
     """Build the kernel of a Newton iteration: energy, gradient and Gauss-Newton factor of all terms of an element.
 
     Compression lowers the stiffness across an edge, which can make the matrix indefinite. Islands flagged `drop_compression` omit
     it, and triangles the negative part of their stress; such islands write no second derivatives. Energies go to the buffer that
-    the line search does not use. The flag `frames_outdated` is set where reference frames must be updated before the next step.
+    the line search does not use.
+
+    Uncoupled rods take `kernels.residual.rod_residual.evaluate_kernel` instead, which keeps gradients in registers.
 
     Args:
         curved: True if second derivatives are written, from iteration `exact_from` on; with the factor, compression included, they
             make the exact Hessian. False for a Gauss-Newton matrix.
         mixed_axial: True if rows of edges have only the stiffness that the matrix carries, and slacks are written; see
             `kernels.linear.mixed_axial_force`.
-        project: True if all islands drop compression, second derivatives or not.
-        reuse: True if factors are written at the first iterate of a step only.
     """
-    Inputs, Results, W = storage.Inputs, results_type(real, linear, storage.slots is not None), storage.Window
-    items, last_item, count_of, clears_active = storage.items, storage.last_item, storage.count, storage.clears_active
-    whole_of, read, column_of, write = storage.whole, storage.read, storage.column, write_function(storage, real, real)
-    measures = [access.term.measure for access in storage.terms]
-    # Alternatives: a loop over the terms, or a recursive function.
-    # Measured: for wp.static(each[i]) of a loop variable Warp generates all code of a kernel whenever it is defined, compiled or not,
-    # 0.3 s each. Recursion costs 5 % of a step on the CPU.
-    terms, everywhere = len(measures), measures[0].span == 1 or len(measures) == 1
-    several = terms > 1
-    first_term, last_term = (evaluate_function(storage, index, real, linear, curved, mixed_axial) for index in (0, -1))
-    stale = next((m.stale(real) for m in measures if m.stale), None)
-    packed = max(m.packed for m in measures) if curved else 0
-    options = CPU_OPTIONS | {"max_unroll": packed} if packed else CPU_OPTIONS
-    bounds = storage.launch_bounds(curved)
+    Inputs, Results = storage.Inputs, results_type(real, linear, storage.slots is not None)
+    items, last_item, count_of = storage.items, storage.last_item, storage.count
+    column_of, write, several = storage.column, write_function(storage, real, real), len(storage.terms) > 1
+    element_at = element_function(storage, real, linear, curved, mixed_axial, not several)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=bounds, module_options=options)
+    @wp.kernel(
+        module="unique", enable_backward=False, grid_stride=False, module_options=element_options(storage, curved)
+    )
     def evaluate(
         inputs: Inputs, flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), exact_from: int, results: Results
     ):
         i, j = wp.tid()
         island, first = items(i, j)
-        if wp.static(clears_active):
-            if i == 0 and j == 0:
-                flags[ANY_ACTIVE, 0] = 0
         count = count_of(inputs, island)
         if flags[STATUS, island] != 0 or first >= count:
             return
-        frozen = wp.static(reuse) and flags[ITERATION, island] > 0
-        clamped = wp.static(project) or flags[DROP_COMPRESSION, island] != 0
-        exact = flags[ITERATION, island] >= exact_from and flags[DROP_COMPRESSION, island] == 0
+        clamped = flags[DROP_COMPRESSION, island] != 0
+        exact = flags[ITERATION, island] >= exact_from and not clamped
         slot = 1 - flags[ENERGY_BUFFER, island]
         carried = scalars[MAX_EDGE_STIFFNESS, island]
         for e in range(first, last_item(first, count)):
             column = column_of(inputs, island, e)
-            whole = whole_of(inputs, island, e)
-            q, s = read(inputs, island, e, whole)
-            if wp.static(stale is not None):  # before the terms: after them, dofs would occupy 30 to 50 more registers
-                if whole and stale(q, s):
-                    flags[FRAMES_OUTDATED, island] = 1
-            energy = real(0.0)
-            f = W()
-            stiffest = real(0.0)
-            if whole or wp.static(everywhere):
-                term_energy, part, stiff = first_term(
-                    inputs, results, q, s, clamped, frozen, exact, carried, island, e, column
-                )
-                energy += term_energy
-                f += part
-                stiffest = wp.max(stiffest, stiff)
-            if wp.static(terms > 1):
-                energy_too, part_too, stiff_too = last_term(
-                    inputs, results, q, s, clamped, frozen, exact, carried, island, e, column
-                )
-                energy += energy_too
-                f += part_too
-                stiffest = wp.max(stiffest, stiff_too)
+            energy, f, stiffest = element_at(inputs, flags, results, clamped, False, exact, carried, island, e, column)
             results.energy[slot, column] = energy
             results.stiffness[column] = linear(stiffest)
             if wp.static(several):

@@ -280,7 +280,7 @@ def _term_access(kind: RodKind, index: int, real) -> TermAccess:
 
 
 @cache
-def rod_storage(kind: RodKind, real, linear=None) -> ElementStorage:
+def rod_storage(kind: RodKind, real) -> ElementStorage:
     """Return the storage of uncoupled rods: an island is a rod, and all terms have one window."""
     Inputs, missing, closed, rod_major = (
         rod_elements_type(kind.dim, real),
@@ -325,11 +325,6 @@ def rod_storage(kind: RodKind, real, linear=None) -> ElementStorage:
     def displacement(inputs: Inputs, w: wp.array3d(dtype=real), r: int, k: int, all: bool):
         return displaced(w, k, inputs.count[r], all, r)
 
-    def launch_bounds(curved: bool):
-        # Measured: three blocks a multiprocessor, 168 registers instead of 170, save 30 % at 100,000 rods on an H200; second
-        # derivatives in float64 need more registers, and take a quarter less time with two blocks.
-        return 128, 2 if curved and linear == wp.float64 else 3
-
     return ElementStorage(
         terms=tuple(_term_access(kind, index, real) for index in range(len(kind.terms))),
         Inputs=Inputs,
@@ -345,6 +340,4 @@ def rod_storage(kind: RodKind, real, linear=None) -> ElementStorage:
         displacement=displacement,
         Displacements=wp.array3d(dtype=real),
         stiffness_dofs=kind.dim,
-        clears_active=True,
-        launch_bounds=launch_bounds,
     )

@@ -73,7 +73,7 @@ def rod_kernels(kind: RodKind, real):
     V, M, P = wp.types.vector(dim, real), wp.types.matrix((dim, dim), real), wp.types.vector(ROWS, real)
     Inertia = inertia_type(kind, real)
     half = edge_function(dim, real)
-    _, previous, *_ = node_functions(kind, real)
+    previous, _ = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
     until = until_function(kind.serial)
 

@@ -188,6 +188,7 @@ def sum_kernels(kind: RodKind, real, linear):
         residual: wp.array3d(dtype=linear),
         change: wp.array2d(dtype=real),
         rounding_error: wp.array2d(dtype=linear),
+        run: int,
         count: wp.array(dtype=int),
         status: wp.array(dtype=int),
         ranges: int,
@@ -201,9 +202,10 @@ def sum_kernels(kind: RodKind, real, linear):
         rounding = real(0.0)
         square = real(0.0)
         worst = real(0.0)
-        for k in range(i, count[r], ranges):
+        for k in range(i, (count[r] + run - 1) / run, ranges):
             total += change[k, r]
             rounding += real(rounding_error[k, r])
+        for k in range(i, count[r], ranges):
             for d in range(wp.static(nb)):
                 size = wp.abs(real(residual[d, k, r]))
                 worst = wp.max(worst, size)

@@ -100,6 +100,7 @@ def sweep_kernel(
         rhs: wp.array3d(dtype=linear),
         energy_change: wp.array2d(dtype=real),
         energy_noise: wp.array2d(dtype=linear),
+        run: int,
         count: wp.array(dtype=int),
         # inertia
         mass: wp.array2d(dtype=Inertia),
@@ -137,8 +138,6 @@ def sweep_kernel(
         ra = H()
         rb = H()
         worst = linear(0.0)  # largest residual
-        change = real(0.0)  # of the energy, from the accepted iterate to this one
-        rounding_error = real(0.0)  # rounding of `change`
         newton = real(0.0)  # r^T H^-1 r
         lost_here = int(0)
         if wp.static(mixed_axial):
@@ -148,8 +147,6 @@ def sweep_kernel(
         f = rows_of(F, 0, r)
         rj = vector(rhs, 0, 0, r)
         mask = fixed[0, r]
-        more = energy_change[0, r]
-        rounding = energy_noise[0, r]
         node_mass = real(0.0)
         spin = real(0.0)
         if wp.static(not drag):
@@ -161,8 +158,6 @@ def sweep_kernel(
             f_ahead = rows_of(F, next, r)
             r_ahead = vector(rhs, 0, next, r)
             mask_ahead = fixed[next, r]
-            more_ahead = energy_change[next, r]
-            rounding_ahead = energy_noise[next, r]
             node_mass_ahead = real(0.0)
             spin_ahead = real(0.0)
             if wp.static(not drag):
@@ -217,9 +212,6 @@ def sweep_kernel(
             if wp.static(twist):
                 Waa[wp.static(angle), wp.static(angle)] = Waa[wp.static(angle), wp.static(angle)] + linear(c * spin)
             worst = wp.max(worst, wp.max(wp.abs(rj)))
-            if not first:
-                change += more
-                rounding_error += real(rounding)
             if wp.static(mixed_axial):
                 unmasked = H(linear(1.0))
             if mask != wp.uint8(0):
@@ -294,17 +286,20 @@ def sweep_kernel(
             f = f_ahead
             rj = r_ahead
             mask = mask_ahead
-            more = more_ahead
-            rounding = rounding_ahead
             node_mass = node_mass_ahead
             spin = spin_ahead
 
         scalars[MAX_RESIDUAL, r] = real(worst)
+        change = real(0.0)  # of the energy, from the accepted iterate to this one
+        rounding_error = real(0.0)  # rounding of `change`
+        if not first:
+            for i in range((n + run - 1) / run):
+                change += energy_change[i, r]
+                rounding_error += real(energy_noise[i, r])
         if first:
             if scalars[LOAD_SCALE, r] == real(0.0):
                 scalars[LOAD_SCALE, r] = real(worst)
             flags[LOST_PIVOTS_TOTAL, r] = 0
-            change = real(0.0)
         finite = wp.isfinite(worst) and wp.isfinite(newton) and wp.isfinite(change)
         if lost_here > 0 and flags[DROP_COMPRESSION, r] == 0:
             if wp.static(fails):

@@ -11,6 +11,7 @@ from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.rod_layout import rod_storage
 from ddg_warp.solve.newton.rod_newton import NewtonOptions, RodNewton
+from tests.rod_gradients import element_gradients
 
 KINDS = {
     "full": {},
@@ -69,7 +70,11 @@ class Problem:
         self.last = state.last
 
     def iterate(self):
-        self.newton.iterate(self.last)
+        """Perform an iteration, and keep the factors and gradients of the iterate that it starts from."""
+        self.newton.evaluate(self.last)
+        self.factor = device_arrays.download(self.newton.elements.factor)
+        self.gradient = element_gradients(self.newton, self.last)
+        self.newton.sweep()
 
     def dofs(self, position, angle) -> np.ndarray:
         """Return device arrays of nodes and angles as (columns, n, dofs of a node)."""
@@ -130,12 +135,9 @@ class Problem:
         return (bits & 1 == 0).ravel()
 
     def dense(self, column: int, q: np.ndarray):
-        """Return Gauss-Newton matrix and residual of a rod at q, from the output of the evaluate kernel."""
+        """Return Gauss-Newton matrix and residual of a rod at its last evaluated iterate q, from factors and gradients there."""
         kind, n = self.kind, self.count[column]
-        F, g = (
-            device_arrays.download(self.newton.elements.factor),
-            device_arrays.download(self.newton.elements.gradient),
-        )
+        F, g = self.factor, self.gradient
         diagonal, target, force = self.inertia(column)
         H, r = np.diag(diagonal), force - diagonal * (q - target)
         edge_row, tension_row = kind.vertex_strains * kind.window, kind.factor_rows - kind.tensions

@@ -9,6 +9,7 @@ from ddg_warp import device_arrays
 from ddg_warp.solve.linear.cyclic_reduction import Elimination
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
 from ddg_warp.solve.newton.rod_newton_assembled import EliminationNewton
+from tests.rod_gradients import element_gradients
 
 KINDS = {"twist": {}, "planar": {"dimension": 2}, "stretch": {"bend": False}}
 # Every kind of rod compiles separate kernels: daily runs take the closed one with all terms.
@@ -70,7 +71,10 @@ class Problem:
         newton.islands.inertia_coefficient.assign(random.uniform(1.0, 3.0, size=4))
         newton.islands.inverse_step.fill_(1.0)
         self.before = self.dofs()
-        newton.iterate(state.last)
+        newton.evaluate(state.last)
+        self.factor = device_arrays.download(newton.elements.factor)
+        self.gradient = element_gradients(newton, state.last)
+        newton.sweep()
 
     def dofs(self) -> np.ndarray:
         q = np.moveaxis(device_arrays.download(self.newton.iterates.x), 0, 1)
@@ -83,10 +87,7 @@ class Problem:
     def dense(self, column: int):
         """Return matrix (identity on fixed dofs), residual (zero there) and free mask, from element factors and gradients."""
         kind, host, n = self.kind, self.group.host, int(self.count[column])
-        F, g = (
-            device_arrays.download(a)[:, :, column]
-            for a in (self.newton.elements.factor, self.newton.elements.gradient)
-        )
+        F, g = (values[:, :, column] for values in (self.factor, self.gradient))
         c, rod = float(device_arrays.download(self.newton.islands.inertia_coefficient)[column]), column % 2
         diagonal, force = np.zeros((n, kind.block)), np.zeros((n, kind.block))
         diagonal[:, : kind.dim] = c * host.mass[:n, rod, None]

@@ -7,7 +7,6 @@ import warp as wp
 from ddg_warp import argument_checks, device_arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core.islands import Islands
-from ddg_warp.kernels.elements import element_path, rod_layout
 from ddg_warp.kernels.linear import geometric_stiffness, mixed_axial_force
 from ddg_warp.kernels.newton import rod_iterate
 from ddg_warp.kernels.newton import rod_sweep as sweep
@@ -20,6 +19,10 @@ FIRST_EXACT_ITERATION = 2  # Gauss-Newton iterations of "progressive": far from 
 PSD_MODES = ("auto", "gauss_newton", "project", "progressive", "none")
 FROZEN = ("auto", "gauss_newton")  # `psd` modes of a frozen Hessian
 FROZEN_ONLY = "psd {!r}: the solver 'projective' freezes the matrix of 'gauss_newton'"
+RUN_THREADS, LONGEST_RUN = (
+    50_000,
+    16,
+)  # least threads of an evaluation on a GPU, if nodes suffice, and most nodes of one
 MANY = 50_000  # rods from which full blocks of the sweep pay on a GPU; below, small ones reach more multiprocessors
 
 
@@ -101,7 +104,9 @@ class RodNewton:
         kind, device = group.kind, model.wp_device
         self.iterates = RodIterates.of(group, self.real)
         self.loading = RodLoading.of(group, self.iterates)
-        self.norms = RodResidualNorms.of(group, self.real, self.linear)
+        self.run = _run(group)
+        self.runs = -(-group.nodes // self.run)
+        self.norms = RodResidualNorms.of(group, self.runs, self.real, self.linear)
         self.rhs, self.direction = (
             device_arrays.allocate((rows, group.nodes, group.columns), self.linear, device)
             for rows in (kind.block, kind.block + mixed_axial)
@@ -115,17 +120,10 @@ class RodNewton:
         if self.psd == "project" and self.exact:
             self._project = geometric_stiffness.project_kernel(kind, self.real, self.linear)
         self.device = device
-        self._evaluate = element_path.evaluate_kernel(
-            rod_layout.rod_storage(kind, self.real, self.linear),
-            self.real,
-            self.linear,
-            self.exact,
-            mixed_axial,
-            self.definite,
-            self.reuse,
+        self._evaluate = rod_residual.evaluate_kernel(
+            kind, self.real, self.linear, self.exact, mixed_axial, self.definite, self.reuse
         )
         self._results = self.elements.results()
-        self._check = rod_residual.check_kernel(kind, self.real, self.linear)
         self._predict = rod_step.predict_kernel(kind, self.real, self.linear, midpoint)
         self._further = None if midpoint else warm_start.further_kernel(kind, self.real, self.linear)
         self._prepare_sweep(mixed_axial)
@@ -163,7 +161,7 @@ class RodNewton:
     @property
     def kernels_around(self) -> list:
         """Kernels that do not depend on the linear solver."""
-        result = [self._predict, (self._evaluate, 128), self._check]
+        result = [self._predict, (self._evaluate, 128)]
         return [*result, *(kernel for kernel in (self._further, self._project) if kernel)]
 
     def pcg_iterations(self) -> int:
@@ -205,19 +203,22 @@ class RodNewton:
     def iterate(self, last: wp.array) -> None:
         """Perform one iteration of every active rod."""
         self.evaluate(last)
-        self.check()
         self.sweep()
 
     @timer("evaluate")
     def evaluate(self, last: wp.array) -> None:
-        """Evaluate energies, gradients and Gauss-Newton factors of all elements at the iterate."""
-        group, islands = self.group, self.islands
-        inputs = group.element_inputs(self.iterates, last, islands.inverse_step)
+        """Evaluate elements at the iterate, residuals, the change of the energy, and the rods that are out of equilibrium."""
+        group, islands, options = self.group, self.islands, self.options
+        iterates, loading = self.iterates, self.loading
         wp.launch(
             self._evaluate,
-            group.element_threads,
-            [inputs, *islands.arrays, self.exact_from or 0],
-            [self._results],
+            (self.runs, group.columns),
+            [group.element_inputs(iterates, last, islands.inverse_step), self.run, self.exact_from or 0]
+            + [loading.mass, loading.rotary, *islands.arrays]
+            + [iterates.base, self.direction, iterates.target, iterates.target_angle]
+            + [group.gravity, loading.force, loading.moment, int(loading.loaded), group.fixed, group.length]
+            + [options.rtol, options.floor_factor * self.eps],
+            [self._results, self.rhs, self.norms.change, self.norms.rounding_error],
             device=self.device,
             block_dim=128,
         )
@@ -229,23 +230,6 @@ class RodNewton:
                 [self.elements.geometric],
                 device=self.device,
             )
-
-    @timer("residual")
-    def check(self) -> None:
-        """Compute residuals, the change of the energy, and the rods that are out of equilibrium."""
-        group, options = self.group, self.options
-        iterates, loading, elements = self.iterates, self.loading, self.elements
-        wp.launch(
-            self._check,
-            group.node_threads,
-            [elements.gradient, elements.energy, elements.stiffness, group.count]
-            + [loading.mass, loading.rotary, *self.islands.arrays]
-            + [iterates.x, iterates.theta, iterates.base, self.direction, iterates.target, iterates.target_angle]
-            + [group.gravity, loading.force, loading.moment, int(loading.loaded), group.fixed, group.length]
-            + [options.rtol, options.floor_factor * self.eps],
-            [self.rhs, self.norms.change, self.norms.rounding_error],
-            device=self.device,
-        )
 
     def sweep(self) -> None:
         """Factorise, decide, and take the next step."""
@@ -272,7 +256,7 @@ class RodNewton:
             self._sweep,
             group.columns,
             [self.elements.factor, self.elements.geometric]
-            + [self.rhs, self.norms.change, self.norms.rounding_error, group.count]
+            + [self.rhs, self.norms.change, self.norms.rounding_error, self.run, group.count]
             + [self.loading.mass, self.loading.rotary, *self.islands.arrays, group.fixed]
             + [options.floor_factor * self.eps, options.rotation_cap]
             + [options.max_iterations, options.max_halvings]
@@ -280,3 +264,10 @@ class RodNewton:
             device=self.device,
             block_dim=self._threads,
         )
+
+
+def _run(group) -> int:
+    """Return the nodes that a thread evaluates: on a GPU few, so that all multiprocessors have work."""
+    if group.kind.serial:
+        return group.nodes
+    return min(max(1, group.nodes * group.columns // RUN_THREADS), LONGEST_RUN, group.nodes)

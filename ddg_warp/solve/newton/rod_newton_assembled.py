@@ -84,7 +84,7 @@ class AssembledNewton(RodNewton):
             self._weigh,
             self.ranges,
             [self.rhs, self.norms.change, self.norms.rounding_error]
-            + [self.group.count, self.islands.status, self.ranges],
+            + [self.run, self.group.count, self.islands.status, self.ranges],
             [self.partial],
         )
         wp.launch(

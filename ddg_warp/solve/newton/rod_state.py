@@ -67,18 +67,17 @@ class RodLoading:
 
 @dataclass
 class RodElements:
-    """Energies, gradients and Hessian factors of elements at an iterate (rows, n, R).
+    """Energies and Hessian factors of elements at an iterate (rows, n, R).
 
     Attributes:
         factor: Gauss-Newton factors, and tensions in the mixed axial-force formulation.
         geometric: second derivatives, one entry if not computed.
-        gradient: by local dofs; energy: of this iterate and of the accepted one.
+        energy: of this iterate and of the accepted one.
         stiffness: (n, R) stiffness sums, for rounding bounds.
     """
 
     factor: wp.array
     geometric: wp.array
-    gradient: wp.array
     energy: wp.array
     stiffness: wp.array
 
@@ -87,8 +86,8 @@ class RodElements:
         """Return zeros, with room for second derivatives if `exact`."""
         kind, nodes = group.kind, (group.nodes, group.columns)
         second = (kind.geometric_rows, *nodes) if exact else (1, 1, 1)
-        shapes = (kind.factor_rows + mixed_axial, *nodes), second, (kind.window, *nodes), (2, *nodes), nodes
-        dtypes = linear, linear, real, real, linear
+        shapes = (kind.factor_rows + mixed_axial, *nodes), second, (2, *nodes), nodes
+        dtypes = linear, linear, real, linear
         layouts = zip(shapes, dtypes, strict=True)
         return cls(*(device_arrays.allocate(shape, dtype, group.device) for shape, dtype in layouts))
 
@@ -96,14 +95,14 @@ class RodElements:
         """Return the arrays by columns, for the kernel of an iteration."""
         result = element_path.results_type(self.energy.dtype, self.factor.dtype)()
         result.factor = result.tension = device_arrays.columns(self.factor)
-        result.second, result.gradient = device_arrays.columns(self.geometric), device_arrays.columns(self.gradient)
-        result.energy, result.stiffness = device_arrays.columns(self.energy), device_arrays.columns(self.stiffness)
+        result.second, result.energy = device_arrays.columns(self.geometric), device_arrays.columns(self.energy)
+        result.stiffness = device_arrays.columns(self.stiffness)
         return result
 
 
 @dataclass
 class RodResidualNorms:
-    """Norms of an iterate by node (n, R), for the line search.
+    """Sums over runs of nodes of an iterate (runs, R), for the line search.
 
     Attributes:
         change: change of the energy [J]; rounding_error: its rounding bound over the unit roundoff.
@@ -113,7 +112,7 @@ class RodResidualNorms:
     rounding_error: wp.array
 
     @classmethod
-    def of(cls, group, real, linear) -> "RodResidualNorms":
+    def of(cls, group, runs: int, real, linear) -> "RodResidualNorms":
         """Return zero norms."""
-        nodes = group.nodes, group.columns
-        return cls(*(device_arrays.allocate(nodes, dtype, group.device) for dtype in (real, linear)))
+        shape = runs, group.columns
+        return cls(*(device_arrays.allocate(shape, dtype, group.device) for dtype in (real, linear)))
