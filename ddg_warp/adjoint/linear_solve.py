@@ -204,7 +204,7 @@ class DirectSolve:
         """Kernels to load before a capture."""
         around = [(self.system._evaluate, 128)]
         if self.solver is None:
-            return [*around, (self.system._sweep, self.system._threads)]
+            return [*around, *self.system.sweeps]
         refined = [self._product, self._guess, self._rest, self._add] if self.passes else []
         return [*around, self.system._assemble, *self.solver.kernels, *refined]
 

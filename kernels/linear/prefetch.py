@@ -11,7 +11,7 @@ from ddg_warp.kernels.elements.rod_layout import RodKind
 def read_functions(kind: RodKind, linear, rows: int, prefetch: bool):
     """Return the device functions `rows_of`, `entry`, `part`, `with_angle` and `positions`.
 
-    `rows_of(F, k, r)`: all rows of the elements that start at node k if `prefetch`, else nothing.
+    `rows_of(F, vertex, edge, r)`: all rows of a vertex and of an edge if `prefetch`, else nothing.
     `entry`: one entry, of prefetched rows or of F.
     `part`: the entries of a node's position.
     `with_angle`: a vector with the twist angle's entry added.
@@ -19,13 +19,16 @@ def read_functions(kind: RodKind, linear, rows: int, prefetch: bool):
     """
     dim, nb, twist, angle = kind.dim, kind.block, kind.twist, kind.block - 1
     H, M, Rows = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear), wp.types.vector(rows, linear)
+    vertex_rows = kind.vertex_strains * kind.window
 
     @wp.func
-    def rows_of(F: wp.array3d(dtype=linear), k: int, r: int):
+    def rows_of(F: wp.array3d(dtype=linear), vertex: int, edge: int, r: int):
         v = Rows()
         if wp.static(prefetch):
-            for i in range(wp.static(rows)):
-                v[i] = F[i, k, r]
+            for i in range(wp.static(vertex_rows)):
+                v[i] = F[i, vertex, r]
+            for i in range(wp.static(vertex_rows), wp.static(rows)):
+                v[i] = F[i, edge, r]
         return v
 
     @wp.func
@@ -60,12 +63,12 @@ def read_functions(kind: RodKind, linear, rows: int, prefetch: bool):
 
 
 @cache
-def prefetch_functions(nb: int, linear, size: int, prefetch: bool):
-    """Return the device functions `kept`, `left_at` and `times`.
+def prefetch_functions(nb: int, linear, size: int, prefetch: bool, columns: int):
+    """Return the device functions `kept`, `left_at`, `times` and `times_far`.
 
     `kept(Y, k, r)`: all kept data of an eliminated node if `prefetch`, else nothing.
     `left_at`: one entry of the kept data.
-    `times`: a kept block times a vector.
+    `times`: a kept block times a vector; `times_far`: a block of which the first `columns` are kept.
     """
     H, Kept = wp.types.vector(nb, linear), wp.types.vector(size, linear)
 
@@ -92,4 +95,12 @@ def prefetch_functions(nb: int, linear, size: int, prefetch: bool):
                 v[i] = v[i] + left_at(left, Y, row + i * wp.static(nb) + j, k, r) * e[j]
         return v
 
-    return kept, left_at, times
+    @wp.func
+    def times_far(left: Kept, Y: wp.array3d(dtype=linear), row: int, k: int, r: int, e: H):
+        v = H()
+        for i in range(wp.static(nb)):
+            for j in range(wp.static(columns)):
+                v[i] = v[i] + left_at(left, Y, row + i * wp.static(columns) + j, k, r) * e[j]
+        return v
+
+    return kept, left_at, times, times_far

@@ -4,7 +4,14 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import ANGLE_STEP_LEFT, EDGES_ROTATED, ITERATE_ACTION, STEP_LENGTH
+from ddg_warp.kernels.core.islands import (
+    ANGLE_STEP_LEFT,
+    EDGES_ROTATED,
+    ITERATE_ACTION,
+    NEEDS_DIRECTION,
+    STEP_LENGTH,
+    STRAIGHT_ROTATION_LIMIT,
+)
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements import parallel_transport
 from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions
@@ -114,13 +121,33 @@ def shorter_function(real):
 
 
 @cache
+def take_function(real):
+    """Return the device function `take(flags, scalars, rotation, cap, r)`: set the length of a straight step that a sweep took.
+
+    It is cut to the rotation cap. The step becomes an edge-rotation update if an edge rotates far; `rotation` is its largest squared
+    rotation.
+    """
+
+    @wp.func
+    def take(flags: wp.array2d(dtype=int), scalars: wp.array2d(dtype=real), rotation: real, cap: real, r: int):
+        whole = real(1.0)
+        if rotation > cap * cap:
+            whole = cap / wp.sqrt(rotation)
+        if rotation > scalars[STRAIGHT_ROTATION_LIMIT, r] * scalars[STRAIGHT_ROTATION_LIMIT, r]:
+            scalars[ANGLE_STEP_LEFT, r] = whole - real(1.0)
+            flags[ITERATE_ACTION, r] = wp.static(ROTATE_EDGES)
+        scalars[STEP_LENGTH, r] = whole
+
+    return take
+
+
+@cache
 def search_functions(kind: RodKind, real, linear, mixed_axial: bool = False):
-    """Return the device functions `place`, `turn_angles`, `relag` and `shorter` of a line search on a rod.
+    """Return the device functions `place`, `turn_angles` and `relag` of a line search on a rod.
 
     `place`: take an edge-rotation update.
     `turn_angles`: update twist angles.
     `relag`: update frames.
-    `shorter`: shorten a step.
     """
     dim, twist, angle, every = kind.dim, kind.twist, kind.block - 1, (1 << kind.dim) - 1
     V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
@@ -218,21 +245,23 @@ def search_functions(kind: RodKind, real, linear, mixed_axial: bool = False):
         if wp.static(closed):
             frame[6, n - 1, r] = reference_twist(u0, u_first, t0, t_first, frame[6, n - 1, r])
 
-    return place, turn_angles, relag, shorter_function(real)
+    return place, turn_angles, relag
 
 
 @cache
-def adjust_kernel(kind: RodKind, real, linear, mixed_axial: bool = False, assembled: bool = False):
+def adjust_kernel(
+    kind: RodKind, real, linear, mixed_axial: bool = False, assembled: bool = False, two_sided: bool = False
+):
     """Build the kernel that completes an iteration.
 
     `adjust`: write a shortened or far-rotating step, or update the frames of its iterate.
 
     `assembled`: the iteration is of `AssembledNewton`, which keeps `base` and leaves straight updates to this kernel. The sweep takes
-    them itself.
+    them itself. `two_sided`: the sweep was from both ends, and left the largest squared rotations of the two sides in `rotations`.
     """
     dim, twist = kind.dim, kind.twist
     V = wp.types.vector(dim, real)
-    place, turn_angles, relag, _ = search_functions(kind, real, linear, mixed_axial)
+    (place, turn_angles, relag), take = search_functions(kind, real, linear, mixed_axial), take_function(real)
     step_of, *_ = move_functions(kind, real, linear, mixed_axial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -247,8 +276,13 @@ def adjust_kernel(kind: RodKind, real, linear, mixed_axial: bool = False, assemb
         theta: wp.array2d(dtype=real),
         frame: wp.array3d(dtype=real),
         base: wp.array2d(dtype=V),
+        rotations: wp.array2d(dtype=real),
+        rotation_cap: real,
     ):
         r = wp.tid()
+        if wp.static(two_sided):
+            if flags[NEEDS_DIRECTION, r] != 0:
+                take(flags, scalars, wp.max(rotations[0, r], rotations[1, r]), rotation_cap, r)
         if flags[ITERATE_ACTION, r] == wp.static(ROTATE_EDGES):
             if flags[EDGES_ROTATED, r] == 0:
                 # the sweep took a straight update; its base positions are needed from here on

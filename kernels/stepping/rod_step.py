@@ -58,7 +58,7 @@ def predict_kernel(kind: RodKind, real, linear, midpoint: bool):
     """
     dim, carried = kind.dim, kind.twist and midpoint
     V = wp.types.vector(dim, real)
-    place, _, relag, _ = search_functions(kind, real, linear)
+    place, _, relag = search_functions(kind, real, linear)
     predicted, extrapolation_of = predicted_function(dim, real), repeat_rotation_function(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

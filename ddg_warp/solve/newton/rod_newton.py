@@ -7,9 +7,8 @@ import warp as wp
 from ddg_warp import argument_checks, device_arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core.islands import Islands
-from ddg_warp.kernels.linear import geometric_stiffness, mixed_axial_force
-from ddg_warp.kernels.newton import rod_iterate
-from ddg_warp.kernels.newton import rod_sweep as sweep
+from ddg_warp.kernels.linear import geometric_stiffness
+from ddg_warp.kernels.newton import rod_iterate, rod_sweep
 from ddg_warp.kernels.residual import rod_residual
 from ddg_warp.kernels.stepping import rod_step, warm_start
 from ddg_warp.solve.newton.rod_state import RodElements, RodIterates, RodLoading, RodResidualNorms
@@ -23,6 +22,7 @@ RUN_THREADS, LONGEST_RUN = (
     50_000,
     16,
 )  # least threads of an evaluation on a GPU, if nodes suffice, and most nodes of one
+FEW = 20_000  # rods up to which a GPU eliminates from both ends
 MANY = 50_000  # rods from which full blocks of the sweep pay on a GPU; below, small ones reach more multiprocessors
 
 
@@ -115,7 +115,10 @@ class RodNewton:
         self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
         self.exact = self.psd != "gauss_newton" and kind.span == 2  # a rod that only stretches has its Hessian anyway
         self.exact_from = (FIRST_EXACT_ITERATION if self.psd == "progressive" else 0) if self.exact else None
-        self.elements = RodElements.of(group, self.real, self.linear, self.exact, mixed_axial)
+        self.sides = self._sides(mixed_axial)
+        # One array serves both: a sweep reads the factor of a node before it writes the node's data.
+        shared_rows = rod_sweep.kept_rows(kind) if self.sides == 1 and not mixed_axial else 0
+        self.elements = RodElements.of(group, self.real, self.linear, self.exact, mixed_axial, shared_rows)
         self._project = None
         if self.psd == "project" and self.exact:
             self._project = geometric_stiffness.project_kernel(kind, self.real, self.linear)
@@ -128,14 +131,29 @@ class RodNewton:
         self._further = None if midpoint else warm_start.further_kernel(kind, self.real, self.linear)
         self._prepare_sweep(mixed_axial)
 
+    def _sides(self, mixed_axial: bool) -> int:
+        """Return the ends of a rod from which a sweep eliminates at once: few rods give too few threads otherwise."""
+        group = self.group
+        return 1 if group.kind.serial or mixed_axial or group.columns > FEW else 2
+
     def _prepare_sweep(self, mixed_axial: bool) -> None:
         """Allocate the data of eliminated nodes, and build the kernels of an iteration."""
-        group, kind = self.group, self.group.kind
-        kept = 2 * kind.block**2 + kind.block + (mixed_axial_force.kept_rows(kind.block) if mixed_axial else 0)
-        self.elimination = device_arrays.allocate((kept, group.nodes, group.columns), self.linear, self.device)
-        self._threads = 32 if group.columns < MANY else 128
-        self._sweep = sweep.sweep_kernel(kind, self.real, self.linear, self.exact_from, self.psd == "none", mixed_axial)
-        self._adjust = rod_iterate.adjust_kernel(kind, self.real, self.linear, mixed_axial)
+        group, kind, sides = self.group, self.group.kind, self.sides
+        size, options = (group.nodes, group.columns), (self.exact_from, self.psd == "none")
+        self.elimination = self.elements.factor
+        if sides == 2 or mixed_axial:
+            kept = rod_sweep.kept_rows(kind, mixed_axial, sides)
+            self.elimination = device_arrays.allocate((kept, *size), self.linear, self.device)
+        if sides == 2:
+            self._sweeps = rod_sweep.two_sided_kernels(kind, self.real, self.linear, *options)
+            shape = 3 * kind.block**2 + 2 * kind.block + 2, sides, group.columns
+            self._fronts = device_arrays.allocate(shape, self.linear, self.device)
+            self._sums = device_arrays.allocate((sides, group.columns), self.real, self.device)
+        else:
+            self._sweeps = (rod_sweep.sweep_kernel(kind, self.real, self.linear, *options, mixed_axial),)
+            self._sums = None
+        self._threads = 128 if group.columns >= MANY else 32
+        self._adjust = rod_iterate.adjust_kernel(kind, self.real, self.linear, mixed_axial, two_sided=sides == 2)
 
     def automatic_psd(self) -> str:
         """Return the mode of `NewtonOptions.psd` that suits the rods: Gauss-Newton lacks the effect of natural curvature on roll."""
@@ -156,7 +174,12 @@ class RodNewton:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [*self.kernels_around, (self._sweep, self._threads), self._adjust]
+        return [*self.kernels_around, *self.sweeps, self._adjust]
+
+    @property
+    def sweeps(self) -> list:
+        """Kernels of a sweep, with their block size."""
+        return [(kernel, self._threads) for kernel in self._sweeps]
 
     @property
     def kernels_around(self) -> list:
@@ -244,26 +267,40 @@ class RodNewton:
             self._adjust,
             group.columns,
             [group.count, group.fixed, group.anchor, self.direction, *self.islands.arrays],
-            [self.iterates.x, self.iterates.theta, self.iterates.frame, self.iterates.base],
+            [self.iterates.x, self.iterates.theta, self.iterates.frame, self.iterates.base]
+            + [self._sums, self.options.rotation_cap],
             device=self.device,
         )
 
     @timer("block LDL^T sweep")
     def eliminate(self) -> None:
         """Factorise, decide, find a direction and take a straight update along it."""
-        group, options = self.group, self.options
-        wp.launch(
-            self._sweep,
-            group.columns,
-            [self.elements.factor, self.elements.geometric]
-            + [self.rhs, self.norms.change, self.norms.rounding_error, self.run, group.count]
-            + [self.loading.mass, self.loading.rotary, *self.islands.arrays, group.fixed]
-            + [options.floor_factor * self.eps, options.rotation_cap]
-            + [options.max_iterations, options.max_halvings]
-            + [self.iterates.x, self.iterates.theta, self.iterates.base, self.elimination, self.direction],
-            device=self.device,
-            block_dim=self._threads,
-        )
+        options, islands, iterates, sides = self.options, self.islands.arrays, self.iterates, self.sides
+        data, rounding = self._sweep_data(), options.floor_factor * self.eps
+        limits = options.max_iterations, options.max_halvings
+        if sides == 1:
+            self._launch_sweep(self._sweeps[0], 1, [data, *islands, rounding, options.rotation_cap, *limits])
+            return
+        inward, middle, outward = self._sweeps
+        self._launch_sweep(inward, sides, [data, *islands, self._fronts, self._sums])
+        self._launch_sweep(middle, 1, [data, *islands, rounding, *limits, self._fronts, self._sums, iterates.base])
+        self._launch_sweep(outward, sides, [data, *islands, iterates.base, self._sums])
+
+    def _launch_sweep(self, kernel, sides: int, inputs: list) -> None:
+        columns = self.group.columns
+        size = columns if sides == 1 else (sides, columns)
+        wp.launch(kernel, size, inputs, device=self.device, block_dim=self._threads)
+
+    def _sweep_data(self):
+        """Return the arrays of a sweep."""
+        group, iterates, loading = self.group, self.iterates, self.loading
+        data = rod_sweep.data_type(group.kind, self.real, self.linear)()
+        data.factor, data.second, data.kept = self.elements.factor, self.elements.geometric, self.elimination
+        data.rhs, data.direction, data.run = self.rhs, self.direction, self.run
+        data.change, data.rounding_error = self.norms.change, self.norms.rounding_error
+        data.count, data.fixed, data.mass, data.rotary = group.count, group.fixed, loading.mass, loading.rotary
+        data.x, data.theta = iterates.x, iterates.theta
+        return data
 
 
 def _run(group) -> int:

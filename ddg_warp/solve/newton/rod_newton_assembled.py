@@ -42,8 +42,13 @@ class AssembledNewton(RodNewton):
         self._weigh, self._gauge = line_search.sum_kernels(kind, self.real, self.linear)
         self._decide_action, self._take = line_search.decide_kernels(kind, self.real, self.exact, self.psd == "none")
 
+    def _sides(self, mixed_axial: bool) -> int:
+        """Return zero: the matrix is assembled, not swept."""
+        return 0
+
     def _prepare_sweep(self, mixed_axial: bool) -> None:
-        """Do nothing: the matrix is assembled, not swept."""
+        """Prepare nothing."""
+        self._sums = None
 
     @property
     def kernels(self) -> list:

@@ -70,7 +70,8 @@ class RodElements:
     """Energies and Hessian factors of elements at an iterate (rows, n, R).
 
     Attributes:
-        factor: Gauss-Newton factors, and tensions in the mixed axial-force formulation.
+        factor: Gauss-Newton factors, and tensions in the mixed axial-force formulation. A sweep may overwrite it by the data of
+            eliminated nodes.
         geometric: second derivatives, one entry if not computed.
         energy: of this iterate and of the accepted one.
         stiffness: (n, R) stiffness sums, for rounding bounds.
@@ -82,11 +83,11 @@ class RodElements:
     stiffness: wp.array
 
     @classmethod
-    def of(cls, group, real, linear, exact: bool, mixed_axial: bool) -> "RodElements":
-        """Return zeros, with room for second derivatives if `exact`."""
+    def of(cls, group, real, linear, exact: bool, mixed_axial: bool, rows: int) -> "RodElements":
+        """Return zeros, with room for second derivatives if `exact`, and for `rows` at least in the place of factors."""
         kind, nodes = group.kind, (group.nodes, group.columns)
         second = (kind.geometric_rows, *nodes) if exact else (1, 1, 1)
-        shapes = (kind.factor_rows + mixed_axial, *nodes), second, (2, *nodes), nodes
+        shapes = (max(kind.factor_rows + mixed_axial, rows), *nodes), second, (2, *nodes), nodes
         dtypes = linear, linear, real, linear
         layouts = zip(shapes, dtypes, strict=True)
         return cls(*(device_arrays.allocate(shape, dtype, group.device) for shape, dtype in layouts))
