@@ -110,7 +110,7 @@ def test_directions_and_steps_are_those_of_one_side(device, name, precision):
                 each.iterate(each.last)
             assert_equal(one, two, 10.0 * tolerance)
         assert (one.islands.iteration.numpy() > 1).any()
-        assert np.abs(results(one)["direction"]).max() > 1e-3
+        assert np.abs(results(one)["direction"]).max() > 0.0
 
 
 def test_exact_hessian_from_both_ends(device):
