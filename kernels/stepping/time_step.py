@@ -158,8 +158,8 @@ def finish_kernel(nodes: NodeStorage, real, midpoint: bool, contact: bool = Fals
     `contact`: see `extrapolation_rate_function`.
     """
     coupled, extrapolation_of = nodes.coupled, extrapolation_rate_function(real, midpoint, contact)
-    V, State, (dofs, store) = wp.types.vector(nodes.dim, real), state_type(nodes, real), dof_functions(nodes, real)
-    items, until = nodes.thread_functions
+    V, B, State = wp.types.vector(nodes.dim, real), wp.types.vector(nodes.block, real), state_type(nodes, real)
+    (dofs, store), (items, until) = dof_functions(nodes, real), nodes.thread_functions
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def finish(
@@ -198,18 +198,19 @@ def finish_kernel(nodes: NodeStorage, real, midpoint: bool, contact: bool = Fals
             extrapolation *= trust[island]
         for k in range(first, until(first, n)):
             start = dofs(before.x, before.theta, k, island)
-            v = dofs(before.v, before.omega, k, island)
-            a = dofs(a0, alpha0, k, island)
             end = start
+            v = B()
+            a = B()
             if moves:
                 end = dofs(x, theta, k, island)
                 a = (end - dofs(predicted, predicted_angle, k, island)) * extrapolation
-                change = (end - start) * scalars[INVERSE_STEP, island]
+                v = (end - start) * scalars[INVERSE_STEP, island]
                 if wp.static(midpoint):
                     end = real(2.0) * end - start
-                    v = real(2.0) * change - v
-                else:
-                    v = change
+                    v = real(2.0) * v - dofs(before.v, before.omega, k, island)
+            else:
+                v = dofs(before.v, before.omega, k, island)
+                a = dofs(a0, alpha0, k, island)
             store(out.x, out.theta, k, island, end)
             store(out.v, out.omega, k, island, v)
             store(a_out, alpha_out, k, island, a)
@@ -224,11 +225,14 @@ def advance_kernel(real):
     `advance`: count the outcome of a substep, and continue (with longer substeps again), retry, or end as failed.
 
     `tally`: counts of outcomes by code, with `rounded` for solves that converged to rounding. `work`: Newton iterations (sum, largest),
-    solves, retries, lost pivots.
+    solves, retries, lost pivots. A thread takes islands `threads` apart, so that few threads add to these.
+
+    Measured: 100,000 rods, an H100: one thread a rod takes 190 us.
     """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def advance(
+        threads: int,
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         retry_limit: int,
@@ -238,50 +242,70 @@ def advance_kernel(real):
         work: wp.array(dtype=wp.int64),
         remaining: wp.array(dtype=int),
     ):
-        r = wp.tid()
-        if scalars[STEP_PROGRESS, r] >= real(1.0):
-            return
-        result = flags[STATUS, r]
-        counted = result
-        if result == wp.static(outcome.CONVERGED_TO_ROUNDING):
-            counted = rounded
-        wp.atomic_add(tally, counted, wp.int64(1))
-        wp.atomic_add(work, 0, wp.int64(flags[ITERATION, r]))
-        wp.atomic_max(work, 1, wp.int64(flags[ITERATION, r]))
-        wp.atomic_add(work, 2, wp.int64(1))
-        if flags[LOST_PIVOTS_TOTAL, r] > 0:
-            wp.atomic_add(work, 4, wp.int64(flags[LOST_PIVOTS_TOTAL, r]))
-        if result <= wp.static(outcome.CONVERGED_TO_ROUNDING):
-            scalars[STEP_PROGRESS, r] = scalars[STEP_PROGRESS, r] + scalars[SUBSTEP_FRACTION, r]
-            flags[COLD_START, r] = 0
-            if scalars[STEP_PROGRESS, r] < real(1.0):
-                flags[RETRIES, r] = 0
-            # double the substep if it starts at a multiple of its length, so that all islands end together
-            longer = real(2.0) * scalars[SUBSTEP_FRACTION, r]
-            if (
-                scalars[STEP_PROGRESS, r] < real(1.0)
-                and longer <= scalars[SUBSTEP, r]
-                and wp.floor(scalars[STEP_PROGRESS, r] / longer) * longer == scalars[STEP_PROGRESS, r]
-            ):
-                scalars[SUBSTEP_FRACTION, r] = longer
-        else:
-            wp.atomic_add(work, 3, wp.int64(1))
-            flags[RETRIES, r] = flags[RETRIES, r] + 1
-            # a cold start would lead to the same step with its energy drift, or to the same minimum
-            again = (
-                result != wp.static(outcome.ENERGY_DRIFT)
-                and flags[PROJECTED_ITERATIONS, r] <= flags[PROJECTED_LIMIT, r]
-            )
-            if again and flags[COLD_START, r] == 0:
-                flags[COLD_START, r] = 1
-            else:
+        iterations = int(0)
+        most = int(0)
+        solves = int(0)
+        retries = int(0)
+        lost = int(0)
+        counted = int(-1)  # the outcome of the last `alike` solves
+        alike = int(0)
+        for r in range(wp.tid(), flags.shape[1], threads):
+            if scalars[STEP_PROGRESS, r] >= real(1.0):
+                continue
+            result = flags[STATUS, r]
+            code = result
+            if result == wp.static(outcome.CONVERGED_TO_ROUNDING):
+                code = rounded
+            if code != counted:
+                if alike > 0:
+                    wp.atomic_add(tally, counted, wp.int64(alike))
+                counted = code
+                alike = 0
+            alike += 1
+            iterations += flags[ITERATION, r]
+            most = wp.max(most, flags[ITERATION, r])
+            solves += 1
+            lost += flags[LOST_PIVOTS_TOTAL, r]
+            if result <= wp.static(outcome.CONVERGED_TO_ROUNDING):
+                scalars[STEP_PROGRESS, r] = scalars[STEP_PROGRESS, r] + scalars[SUBSTEP_FRACTION, r]
                 flags[COLD_START, r] = 0
-                scalars[SUBSTEP_FRACTION, r] = real(0.5) * scalars[SUBSTEP_FRACTION, r]
-            if flags[RETRIES, r] > retry_limit or scalars[SUBSTEP_FRACTION, r] < smallest * scalars[SUBSTEP, r]:
-                flags[FAILURE_STATUS, r] = result
-                flags[STATUS, r] = wp.static(outcome.STEP_FAILED)
-                scalars[STEP_PROGRESS, r] = real(1.0)
-        if scalars[STEP_PROGRESS, r] < real(1.0):
-            remaining[0] = 1
+                if scalars[STEP_PROGRESS, r] < real(1.0):
+                    flags[RETRIES, r] = 0
+                # double the substep if it starts at a multiple of its length, so that all islands end together
+                longer = real(2.0) * scalars[SUBSTEP_FRACTION, r]
+                if (
+                    scalars[STEP_PROGRESS, r] < real(1.0)
+                    and longer <= scalars[SUBSTEP, r]
+                    and wp.floor(scalars[STEP_PROGRESS, r] / longer) * longer == scalars[STEP_PROGRESS, r]
+                ):
+                    scalars[SUBSTEP_FRACTION, r] = longer
+            else:
+                retries += 1
+                flags[RETRIES, r] = flags[RETRIES, r] + 1
+                # a cold start would lead to the same step with its energy drift, or to the same minimum
+                again = (
+                    result != wp.static(outcome.ENERGY_DRIFT)
+                    and flags[PROJECTED_ITERATIONS, r] <= flags[PROJECTED_LIMIT, r]
+                )
+                if again and flags[COLD_START, r] == 0:
+                    flags[COLD_START, r] = 1
+                else:
+                    flags[COLD_START, r] = 0
+                    scalars[SUBSTEP_FRACTION, r] = real(0.5) * scalars[SUBSTEP_FRACTION, r]
+                if flags[RETRIES, r] > retry_limit or scalars[SUBSTEP_FRACTION, r] < smallest * scalars[SUBSTEP, r]:
+                    flags[FAILURE_STATUS, r] = result
+                    flags[STATUS, r] = wp.static(outcome.STEP_FAILED)
+                    scalars[STEP_PROGRESS, r] = real(1.0)
+            if scalars[STEP_PROGRESS, r] < real(1.0):
+                remaining[0] = 1
+        if alike > 0:
+            wp.atomic_add(tally, counted, wp.int64(alike))
+            wp.atomic_add(work, 0, wp.int64(iterations))
+            wp.atomic_max(work, 1, wp.int64(most))
+            wp.atomic_add(work, 2, wp.int64(solves))
+            if retries > 0:
+                wp.atomic_add(work, 3, wp.int64(retries))
+            if lost > 0:
+                wp.atomic_add(work, 4, wp.int64(lost))
 
     return advance

@@ -17,6 +17,7 @@ from ddg_warp.kernels.stepping import time_step as step
 from ddg_warp.solve.forces.prescribed_motion import jump_between
 from ddg_warp.timers import timer
 
+COUNTING = 4096  # most threads that count outcomes on a GPU
 CACHED = 16  # number of step lengths with cached limits
 FOLDED = 1e-5  # angle to opposite edges [rad] that messages call folded
 
@@ -168,8 +169,9 @@ class StepDriver:
         """Launch the retry logic."""
         self.remaining.zero_()
         limit = self.integrator.retry_limit
-        inputs = [*self.islands.arrays, limit, 0.5 ** (limit // 2), self.rounded]
-        self._launch(self._advance, len(self.islands), inputs, [self.tally, self.work, self.remaining])
+        threads = device_arrays.takers(min(len(self.islands), COUNTING), self.model.wp_device)
+        inputs = [threads, *self.islands.arrays, limit, 0.5 ** (limit // 2), self.rounded]
+        self._launch(self._advance, threads, inputs, [self.tally, self.work, self.remaining])
 
     def attempt(self, before, after) -> None:
         """Launch one solve of every unfinished island, from state `before` to `after`."""
