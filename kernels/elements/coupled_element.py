@@ -14,7 +14,13 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
-from ddg_warp.kernels.elements.element_path import ElementStorage, TermAccess, parameter_function, write_rows_function
+from ddg_warp.kernels.elements.element_path import (
+    ElementStorage,
+    TermAccess,
+    measure_functions,
+    parameter_function,
+    write_rows_function,
+)
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.terms import Term
 
@@ -222,7 +228,7 @@ def coupled_storage(term: Term, real, slots: bool = True, serial: bool = False) 
         return q
 
     return ElementStorage(
-        terms=(TermAccess(term, same, same_lagged, same, slack=measure.tensions),),
+        terms=(TermAccess(term, same, same_lagged, same, *measure_functions(measure, real), slack=measure.tensions),),
         Inputs=Inputs,
         Window=Q,
         Lagged=S,

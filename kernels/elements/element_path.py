@@ -29,6 +29,7 @@ from ddg_warp.kernels.core.islands import (
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements.variation import variation_functions
+from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.terms import Term
 
 
@@ -40,18 +41,26 @@ class TermAccess:
         local: (window) -> dofs of the term. short: (lagged) -> its lagged data. spread: (f) -> from its dofs to the window.
         parameter, strain, factor, tension, slack: its first row in each array.
         second: rows of its second derivatives, packed; None for all.
+        functions, stale: of its measure, for the lagged data of the storage.
     """
 
     term: Term
     local: Callable
     short: Callable
     spread: Callable
+    functions: tuple
+    stale: Callable | None
     parameter: int = 0
     strain: int = 0
     factor: int = 0
     tension: int = 0
     slack: int = 1
     second: tuple[int, ...] | None = None
+
+
+def measure_functions(measure: Measure, real) -> tuple:
+    """Return `functions` and `stale` of a `TermAccess`, for lagged data as the measure has them."""
+    return measure.functions(real), measure.stale(real) if measure.stale else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,7 +274,7 @@ def evaluate_function(
     access, Inputs, W, L = storage.terms[index], storage.Inputs, storage.Window, storage.Lagged
     Results, term, measure = results_type(real, linear, storage.slots is not None), access.term, access.term.measure
     n, (Q, _, E, _) = len(measure.strains), measure.types(real)
-    _, jacobian_of, tension_of, curvature_of = measure.functions(real)
+    _, jacobian_of, tension_of, curvature_of = access.functions
     energy_of, slope_of, root_of = term.density.functions(real, n)
     local, short, spread, parameters = (
         access.local,
@@ -367,12 +376,13 @@ def element_function(
 ):
     """Return the device function `element_at` of all terms: write factors, tensions and second derivatives of an element.
 
-    It returns energy, derivative with respect to the window, and the largest stiffness of a strain. Nothing is written of a `frozen`
-    element that is not `exact`. The flag `frames_outdated` is set where reference frames must be updated before the next step. With
-    `writes_gradient` the only term writes its gradient, and the derivative returned is zero.
+    It takes the window q and lagged data s. It returns energy, derivative with respect to the window, and the largest stiffness of a
+    strain. Nothing is written of a `frozen` element that is not `exact`. The flag `frames_outdated` is set where reference frames
+    must be updated before the next step. With `writes_gradient` the only term writes its gradient, and the derivative returned is
+    zero.
     """
-    Inputs, Results, W = storage.Inputs, results_type(real, linear, storage.slots is not None), storage.Window
-    whole_of, read = storage.whole, storage.read
+    Inputs, W, L = storage.Inputs, storage.Window, storage.Lagged
+    Results = results_type(real, linear, storage.slots is not None)
     measures = [access.term.measure for access in storage.terms]
     # Alternatives: a loop over the terms, or a recursive function.
     # Measured: for wp.static(each[i]) of a loop variable Warp generates all code of a kernel whenever it is defined, compiled or not,
@@ -381,13 +391,16 @@ def element_function(
     first_term, last_term = (
         evaluate_function(storage, index, real, linear, curved, mixed_axial, writes_gradient) for index in (0, -1)
     )
-    stale = next((m.stale(real) for m in measures if m.stale), None)
+    stale = next((access.stale for access in storage.terms if access.stale), None)
 
     @wp.func
     def element_at(
         inputs: Inputs,
         flags: wp.array2d(dtype=int),
         results: Results,
+        q: W,
+        s: L,
+        whole: bool,
         clamped: bool,
         frozen: bool,
         exact: bool,
@@ -396,8 +409,6 @@ def element_function(
         e: int,
         column: int,
     ):
-        whole = whole_of(inputs, island, e)
-        q, s = read(inputs, island, e, whole)
         if wp.static(stale is not None):  # before the terms: after them, dofs would occupy 30 to 50 more registers
             if whole and stale(q, s):
                 flags[FRAMES_OUTDATED, island] = 1
@@ -447,7 +458,8 @@ def evaluate_kernel(storage: ElementStorage, real, linear, curved: bool = False,
     """
     Inputs, Results = storage.Inputs, results_type(real, linear, storage.slots is not None)
     items, last_item, count_of = storage.items, storage.last_item, storage.count
-    column_of, write, several = storage.column, write_function(storage, real, real), len(storage.terms) > 1
+    whole_of, read, column_of = storage.whole, storage.read, storage.column
+    write, several = write_function(storage, real, real), len(storage.terms) > 1
     element_at = element_function(storage, real, linear, curved, mixed_axial, not several)
 
     @wp.kernel(
@@ -467,7 +479,11 @@ def evaluate_kernel(storage: ElementStorage, real, linear, curved: bool = False,
         carried = scalars[MAX_EDGE_STIFFNESS, island]
         for e in range(first, last_item(first, count)):
             column = column_of(inputs, island, e)
-            energy, f, stiffest = element_at(inputs, flags, results, clamped, False, exact, carried, island, e, column)
+            whole = whole_of(inputs, island, e)
+            q, s = read(inputs, island, e, whole)
+            energy, f, stiffest = element_at(
+                inputs, flags, results, q, s, whole, clamped, False, exact, carried, island, e, column
+            )
             results.energy[slot, column] = energy
             results.stiffness[column] = linear(stiffest)
             if wp.static(several):

@@ -8,6 +8,7 @@ Parameters of all terms lie in one buffer. Row i of `table` is (offset, stride a
 reads a parameter that is constant, per rod, per element, or both.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
@@ -15,8 +16,9 @@ import warp as wp
 
 from ddg_warp.kernels.core.launch import until_function
 from ddg_warp.kernels.core.nodes import NodeStorage
-from ddg_warp.kernels.elements.element_path import ElementStorage, TermAccess
+from ddg_warp.kernels.elements.element_path import ElementStorage, TermAccess, measure_functions
 from ddg_warp.kernels.measures.bending_second_variation import packed_index
+from ddg_warp.kernels.measures.rod_curvature_twist import EDGE
 from ddg_warp.kernels.terms import Term
 
 
@@ -91,6 +93,15 @@ class RodKind:
     def lagged_rows(self) -> int:
         """Reals of lagged data per edge: reference frame and reference twist of a vertex."""
         return 7 if self.twist else 0
+
+    @property
+    def prepared(self) -> Callable | None:
+        """`Measure.prepared` of the vertices; None if edges are evaluated once for each vertex."""
+        return next((term.measure.prepared for term in self.terms if term.measure.prepared), None)
+
+    def prepared_type(self, real):
+        """Return the type of the prepared data of a vertex."""
+        return wp.types.vector(2 * EDGE + 1, real)
 
     @property
     def viscous(self) -> bool:
@@ -245,11 +256,15 @@ def rod_elements_type(dim: int, real):
 
 
 @cache
-def _term_access(kind: RodKind, index: int, real) -> TermAccess:
+def _term_access(kind: RodKind, index: int, real, prepared: bool) -> TermAccess:
     """Return the access of term `index` to the window and to the term's rows."""
     term, measure = kind.terms[index], kind.terms[index].measure
     Q, S, _, _ = measure.types(real)
-    W, L, lag_size = wp.types.vector(kind.window, real), wp.types.vector(13, real), measure.lag_size
+    L, lag_size, functions = wp.types.vector(13, real), measure.lag_size, measure_functions(measure, real)
+    if prepared:
+        L = kind.prepared_type(real)
+        functions = measure.prepared(real)[1:] if measure.prepared else functions
+    W = wp.types.vector(kind.window, real)
     dofs = [*range(kind.dim * measure.span), *(kind.dim * kind.span + i for i in range(measure.angles))]
     size, where = measure.size, wp.types.vector(measure.size, int)(*dofs)
     second = tuple(packed_index(kind.window, dofs[i], dofs[j]) for i in range(size) for j in range(i, size))
@@ -276,12 +291,16 @@ def _term_access(kind: RodKind, index: int, real) -> TermAccess:
             w[where[i]] = f[i]
         return w
 
-    return TermAccess(term, local, short, spread, parameter, strain, factor, tension, kind.factor_rows, second)
+    rows = parameter, strain, factor, tension, kind.factor_rows
+    return TermAccess(term, local, short, spread, *functions, *rows, second)
 
 
 @cache
-def rod_storage(kind: RodKind, real) -> ElementStorage:
-    """Return the storage of uncoupled rods: an island is a rod, and all terms have one window."""
+def rod_storage(kind: RodKind, real, prepared: bool = False) -> ElementStorage:
+    """Return the storage of uncoupled rods: an island is a rod, and all terms have one window.
+
+    If `prepared`, lagged data are those of `Measure.prepared`, and no function reads them.
+    """
     Inputs, missing, closed, rod_major = (
         rod_elements_type(kind.dim, real),
         0 if kind.closed else 1,
@@ -326,10 +345,10 @@ def rod_storage(kind: RodKind, real) -> ElementStorage:
         return displaced(w, k, inputs.count[r], all, r)
 
     return ElementStorage(
-        terms=tuple(_term_access(kind, index, real) for index in range(len(kind.terms))),
+        terms=tuple(_term_access(kind, index, real, prepared) for index in range(len(kind.terms))),
         Inputs=Inputs,
         Window=wp.types.vector(kind.window, real),
-        Lagged=wp.types.vector(13, real),
+        Lagged=kind.prepared_type(real) if prepared else wp.types.vector(13, real),
         items=items,
         last_item=until_function(kind.serial),
         count=count,

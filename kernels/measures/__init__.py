@@ -46,6 +46,9 @@ class Measure:
         advance: None, or real -> advance(q, s): lagged data behind the frames at the end of a step, from the dofs and frames there
             and the old data.
         stale: None, or real -> stale(q, s): True if frames have to be updated before the next step of a solve.
+        prepared: None, or real -> (edge, functions, stale) of a vertex whose edges are evaluated once for both their vertices.
+            `edge(e, u, t, angle)`: prepared data of an edge from its vector, lagged frame and twist angle, as a vector. `functions`
+            and `stale` are the above, with the prepared data of both edges and the lagged data behind the frames as s.
         sample: None, or (random, count) -> non-default data of sample elements for `ddg_warp.run.derivative_checks`, by name. `nodes
             (nodes, 3)`: centres of the nodes. `data (data_size, count)`. `frame (6, frames * count)`: the first frames of all
             elements first. `lag (rows, count)`: behind the frames. `felt (slots, count)`: local nodes that the strains depend on.
@@ -69,6 +72,7 @@ class Measure:
     frames: int = 0
     advance: Callable | None = None
     stale: Callable | None = None
+    prepared: Callable | None = None
     by_angle: bool = False
     revolved: bool = False
     vectors: tuple[int, ...] = ()

@@ -22,6 +22,8 @@ and its derivative adds to that of `bending_second_variation`: 2 (tt . (v + u)) 
     (te . de) (z . v) / |e| the factors of s_e and s_f times it. (Bergou et al. 2010 give these for frames that do not spin.)
 
 Lagged data: u_e (3), t_e (3), u_f (3), t_f (3), m_ref (1).
+
+Two vertices share the frame of the edge between them. Evaluations along a rod prepare it once: see `prepared`.
 """
 
 from functools import cache
@@ -31,18 +33,38 @@ import warp as wp
 from ddg_warp.kernels.elements import parallel_transport
 from ddg_warp.kernels.measures import Measure, bending_second_variation
 
+EDGE = 14  # reals of the prepared data of an edge
+
 
 @cache
-def functions(real, between: bool = False):
-    """Return the functions of the measure; if `between`, about directors halfway between both edges (see `turning_angle`)."""
+def functions(real, between: bool = False, prepared: bool = False):
+    """Return the functions of the measure; if `between`, about directors halfway between both edges (see `turning_angle`).
+
+    If `prepared`, s has prepared data of the two edges and m_ref.
+    """
     Q, S, E, M = rod_curvature_twist.types(real)
     V = wp.types.vector(3, real)
+    if prepared:
+        S = wp.types.vector(2 * EDGE + 1, real)
     H, M3 = wp.types.vector(36, real), wp.types.matrix((3, 3), real)
     transport, reference_twist, rotate = parallel_transport.functions(real)
     turning_of, across, lengthening = bending_second_variation.functions(real)
 
     @wp.func
-    def material_frames(q: Q, s: S):
+    def prepared_frames(q: Q, s: S):
+        te = V(s[0], s[1], s[2])
+        tf = V(s[14], s[15], s[16])
+        m1e = V(s[6], s[7], s[8])
+        m1f = V(s[20], s[21], s[22])
+        twist = q[7] - q[6] + reference_twist(V(s[3], s[4], s[5]), V(s[17], s[18], s[19]), te, tf, s[28])
+        return te, tf, m1e, wp.cross(te, m1e), m1f, wp.cross(tf, m1f), twist, s[12], s[26]
+
+    @wp.func
+    def prepared_spins(s: S, te: V, tf: V):
+        return V(s[9], s[10], s[11]), V(s[23], s[24], s[25])
+
+    @wp.func
+    def lagged_frames(q: Q, s: S):
         e = V(q[0], q[1], q[2])
         f = V(q[3], q[4], q[5])
         ie = real(1.0) / wp.length(e)
@@ -60,6 +82,15 @@ def functions(real, between: bool = False):
         m1e = rotate(ue, te, angle_e)
         m1f = rotate(uf, tf, angle_f)
         return te, tf, m1e, wp.cross(te, m1e), m1f, wp.cross(tf, m1f), twist, ie, i_f
+
+    @wp.func
+    def lagged_spins(s: S, te: V, tf: V):
+        """Return t0 / (1 + t0 . t) of both edges, whose product with t is the spin of a frame."""
+        t0e = V(s[3], s[4], s[5])
+        t0f = V(s[9], s[10], s[11])
+        return t0e * (real(1.0) / (real(1.0) + wp.dot(t0e, te))), t0f * (real(1.0) / (real(1.0) + wp.dot(t0f, tf)))
+
+    material_frames, spins = (prepared_frames, prepared_spins) if prepared else (lagged_frames, lagged_spins)
 
     @wp.func
     def strains(q: Q, s: S, w: real):
@@ -88,10 +119,9 @@ def functions(real, between: bool = False):
         b1 = -wp.dot(kb, m1f)
         a2 = -wp.dot(kb, m2e)
         b2 = -wp.dot(kb, m2f)
-        t0e = V(s[3], s[4], s[5])
-        t0f = V(s[9], s[10], s[11])
-        ze = wp.cross(t0e, te) / (real(1.0) + wp.dot(t0e, te))
-        zf = wp.cross(t0f, tf) / (real(1.0) + wp.dot(t0f, tf))
+        ye, yf = spins(s, te, tf)
+        ze = wp.cross(ye, te)
+        zf = wp.cross(yf, tf)
         k1e = wp.cross(tf, s2) * ic - tt * k1 - ze * a1
         k1f = -wp.cross(te, s2) * ic - tt * k1 - zf * b1
         k2e = -wp.cross(tf, s1) * ic - tt * k2 - ze * a2
@@ -153,10 +183,7 @@ def functions(real, between: bool = False):
         ee = -wp.dot(b, ge)
         ff = -wp.dot(b, gf)
         # the spin of frames transported in time
-        t0e = V(s[3], s[4], s[5])
-        t0f = V(s[9], s[10], s[11])
-        ye = t0e / (real(1.0) + wp.dot(t0e, te))
-        yf = t0f / (real(1.0) + wp.dot(t0f, tf))
+        ye, yf = spins(s, te, tf)
         ze = wp.cross(ye, te)
         zf = wp.cross(yf, tf)
         moment_e = -be - m3
@@ -216,6 +243,36 @@ def _stale(real):
     return stale
 
 
+@cache
+def _prepared(real):
+    Q, _, _, _ = rod_curvature_twist.types(real)
+    V, P, S = wp.types.vector(3, real), wp.types.vector(EDGE, real), wp.types.vector(2 * EDGE + 1, real)
+    transport, reference_twist, rotate = parallel_transport.functions(real)
+
+    @wp.func
+    def edge(e: V, u0: V, t0: V, angle: real):
+        """Return tangent, reference and material director, t0 / (1 + t0 . t), the inverse length, and t0 . t of an edge."""
+        inverse = real(1.0) / wp.length(e)
+        t = e * inverse
+        u = transport(u0, t0, t)
+        m1 = rotate(u, t, angle)
+        c = wp.dot(t0, t)
+        y = t0 * (real(1.0) / (real(1.0) + c))
+        return P(t[0], t[1], t[2], u[0], u[1], u[2], m1[0], m1[1], m1[2], y[0], y[1], y[2], inverse, c)
+
+    @wp.func
+    def stale(q: Q, s: S):
+        """Return what `_stale` does; see `parallel_transport.stale_function`."""
+        if s[13] >= real(0.9) and s[27] >= real(0.9):
+            return False
+        te = V(s[0], s[1], s[2])
+        tf = V(s[14], s[15], s[16])
+        m = reference_twist(V(s[3], s[4], s[5]), V(s[17], s[18], s[19]), te, tf, s[28])
+        return wp.min(s[13], s[27]) < real(0.0) or wp.abs(m - s[28]) > real(1.5)
+
+    return edge, functions(real, prepared=True), stale
+
+
 rod_curvature_twist = Measure(
     "rod_curvature_twist",
     3,
@@ -227,4 +284,5 @@ rod_curvature_twist = Measure(
     lag_size=13,
     advance=_advance,
     stale=_stale,
+    prepared=_prepared,
 )

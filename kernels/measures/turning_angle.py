@@ -115,6 +115,7 @@ def _by_angle(tangent: Measure, functions) -> Measure:
         name=f"{tangent.name}_angle",
         functions=cache(partial(_functions, tangent, functions)),
         by_angle=True,
+        prepared=None,
     )
 
 

@@ -34,6 +34,7 @@ from ddg_warp.kernels.core.islands import (
 from ddg_warp.kernels.core.launch import renewed
 from ddg_warp.kernels.elements.element_path import element_function, element_options, results_type
 from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions, inertia_type, rod_storage
+from ddg_warp.kernels.measures.rod_curvature_twist import EDGE
 from ddg_warp.kernels.newton.line_search import ROUNDED, SETTLED
 
 
@@ -98,14 +99,28 @@ def evaluate_kernel(
         reuse: True if factors are written at the first iterate of a step only.
     """
     dim, nb, twist, span, closed, drag = kind.dim, kind.block, kind.twist, kind.span, kind.closed, kind.drag
-    V, Inertia, storage = wp.types.vector(dim, real), inertia_type(kind, real), rod_storage(kind, real)
+    prepared = kind.prepared is not None
+    V, Inertia, storage = wp.types.vector(dim, real), inertia_type(kind, real), rod_storage(kind, real, prepared)
     W, Inputs, Results = storage.Window, storage.Inputs, results_type(real, linear, False)
-    along, *_ = gather_functions(kind, real)
-    count_of, column_of = storage.count, storage.column
+    along, window, *_ = gather_functions(kind, real)
+    count_of, column_of, whole_of, read = storage.count, storage.column, storage.whole, storage.read
+    if prepared:
+        edge, *_ = kind.prepared(real)
+        L = storage.Lagged
     element_at, angle = element_function(storage, real, linear, curved, mixed_axial), dim * span
     # Measured: three blocks a multiprocessor, 168 registers instead of 170, save 30 % at 100,000 rods on an H200; second
     # derivatives in float64 need more registers, and take a quarter less time with two blocks.
     bounds = 128, 2 if curved and linear == wp.float64 else 3
+
+    @wp.func
+    def prepared_edge(inputs: Inputs, e: V, angle: real, k: int, r: int):
+        frame = inputs.frame
+        return edge(
+            e,
+            V(frame[0, k, r], frame[1, k, r], frame[2, k, r]),
+            V(frame[3, k, r], frame[4, k, r], frame[5, k, r]),
+            angle,
+        )
 
     @wp.kernel(
         module="unique",
@@ -164,6 +179,9 @@ def evaluate_kernel(
         start = first - wp.static(span)
         if wp.static(not closed):
             start = wp.max(start, 0)
+        if wp.static(prepared):
+            k0 = along(start + wp.where(start < 0, n, 0), n)
+            near = prepared_edge(inputs, inputs.x[along(k0 + 1, n), r] - inputs.x[k0, r], inputs.theta[k0, r], k0, r)
         for j in range(start, wp.min(first + run, n)):
             k = j
             if wp.static(closed):
@@ -177,8 +195,21 @@ def evaluate_kernel(
             column = column_of(inputs, r, k)
             if k < count_of(inputs, r):
                 frozen = not owned or (wp.static(reuse) and iteration > 0)
+                whole = whole_of(inputs, r, k)
+                if wp.static(prepared):
+                    q = window(inputs.x, inputs.theta, k, n, whole, r)
+                    s = L()
+                    for row in range(wp.static(EDGE)):
+                        s[row] = near[row]
+                    if whole:
+                        near = prepared_edge(inputs, V(q[3], q[4], q[5]), q[7], along(k + 1, n), r)
+                    for row in range(wp.static(EDGE)):
+                        s[wp.static(EDGE) + row] = near[row]
+                    s[wp.static(2 * EDGE)] = inputs.frame[6, k, r]
+                else:
+                    q, s = read(inputs, r, k, whole)
                 energy, g, stiff = element_at(
-                    inputs, flags, results, clamped, frozen, exact and owned, carried, r, k, column
+                    inputs, flags, results, q, s, whole, clamped, frozen, exact and owned, carried, r, k, column
                 )
                 if owned:
                     results.energy[1 - accepted, column] = energy
