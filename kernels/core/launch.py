@@ -89,6 +89,6 @@ def wait():
 def renewed(i: int) -> int:
     """Return an index that the CUDA compiler takes for a new one.
 
-    Addresses that depend on it alone stay in a loop, instead of in registers across all of the loop.
+    Addresses that depend on it alone are computed where they are used, instead of before a loop, where they occupy registers.
     """
     ...

@@ -40,7 +40,7 @@ from ddg_warp.kernels.newton.line_search import ROUNDED, SETTLED
 
 @cache
 def node_functions(kind: RodKind, real):
-    """Return the device functions `previous` and `edge_force` of a node.
+    """Return the device functions `previous` and `edge_force` of a stencil.
 
     `previous(k, n)`: element or edge before k.
     `edge_force(g, k, n, r)`: dE/de of edge k, from gradients by the window.
@@ -102,31 +102,50 @@ def evaluate_kernel(
     prepared = kind.prepared is not None
     V, Inertia, storage = wp.types.vector(dim, real), inertia_type(kind, real), rod_storage(kind, real, prepared)
     W, Inputs, Results = storage.Window, storage.Inputs, results_type(real, linear, False)
-    along, window, *_ = gather_functions(kind, real)
-    count_of, column_of, whole_of, read = storage.count, storage.column, storage.whole, storage.read
+    H, X, L = wp.types.vector(nb, linear), wp.types.vector(3, real), storage.Lagged
+    along, *_ = gather_functions(kind, real)
+    count_of, column_of, whole_of, window_of = storage.count, storage.column, storage.whole, storage.read
+    P, by_window, serial = wp.types.vector(EDGE, real), twist and not prepared, kind.serial
     if prepared:
         edge, *_ = kind.prepared(real)
-        L = storage.Lagged
     element_at, angle = element_function(storage, real, linear, curved, mixed_axial), dim * span
-    # Measured: three blocks a multiprocessor, 168 registers instead of 170, save 30 % at 100,000 rods on an H200; second
-    # derivatives in float64 need more registers, and take a quarter less time with two blocks.
-    bounds = 128, 2 if curved and linear == wp.float64 else 3
+
+    @wp.struct
+    class Stencil:
+        x: V  # of the node after next
+        theta: real  # of the next edge, as its frame
+        u: X
+        t: X
+        lagged_twist: real
 
     @wp.func
-    def prepared_edge(inputs: Inputs, e: V, angle: real, k: int, r: int):
-        frame = inputs.frame
-        return edge(
-            e,
-            V(frame[0, k, r], frame[1, k, r], frame[2, k, r]),
-            V(frame[3, k, r], frame[4, k, r], frame[5, k, r]),
-            angle,
-        )
+    def index_of(j: int, n: int):
+        """Return the index of node j of a closed rod; of an open one, that of the nearest existing one."""
+        if wp.static(closed):
+            if j < 0:
+                j += n
+            return wp.max(along(j, n), 0)
+        return wp.max(wp.min(j, n - 1), 0)
+
+    @wp.func
+    def stencil_at(inputs: Inputs, j: int, n: int, r: int):
+        """Read what element j adds to the data of the element before."""
+        out = Stencil()
+        following = index_of(j + 1, n)
+        out.x = inputs.x[index_of(j + 2, n), r]
+        if wp.static(twist):
+            out.theta = inputs.theta[following, r]
+        if wp.static(prepared):
+            out.u = X(inputs.frame[0, following, r], inputs.frame[1, following, r], inputs.frame[2, following, r])
+            out.t = X(inputs.frame[3, following, r], inputs.frame[4, following, r], inputs.frame[5, following, r])
+            out.lagged_twist = inputs.frame[6, index_of(j, n), r]
+        return out
 
     @wp.kernel(
         module="unique",
         enable_backward=False,
         grid_stride=False,
-        launch_bounds=bounds,
+        launch_bounds=(128, 2),
         module_options=element_options(storage, curved),
     )
     def evaluate(
@@ -154,8 +173,8 @@ def evaluate_kernel(
         change_out: wp.array2d(dtype=real),
         noise_out: wp.array2d(dtype=linear),
     ):
-        i, column_of_rod = wp.tid()
-        r = column_of_rod
+        i, rod = wp.tid()
+        r = rod
         if i == 0 and r == 0:
             flags[ANY_ACTIVE, 0] = 0
         n = inputs.count[r]
@@ -179,35 +198,69 @@ def evaluate_kernel(
         start = first - wp.static(span)
         if wp.static(not closed):
             start = wp.max(start, 0)
-        if wp.static(prepared):
-            k0 = along(start + wp.where(start < 0, n, 0), n)
-            near = prepared_edge(inputs, inputs.x[along(k0 + 1, n), r] - inputs.x[k0, r], inputs.theta[k0, r], k0, r)
-        for j in range(start, wp.min(first + run, n)):
-            k = j
-            if wp.static(closed):
-                if j < 0:
-                    k = j + n
+        c = scalars[INERTIA_COEFFICIENT, r]
+        taken = scalars[STEP_LENGTH, r]
+        limit = rtol * scalars[LOAD_SCALE, r]
+        if iteration == 0 or taken < real(1.0):
+            limit /= real(n)
+        # The first iteration prepares the edge at `start`, of the others each takes a node and the element that starts there.
+        # Prefetch, on a GPU: data of the next node are read before this node is processed, since a thread mostly waits for memory.
+        position = V()
+        next_position = inputs.x[index_of(start, n), r]
+        theta = real(0.0)
+        near = P()
+        ahead = Stencil()
+        if wp.static(not serial):
+            ahead = stencil_at(inputs, start - 1, n, r)
+        for j in range(start - 1, wp.min(first + run, n)):
             owned = j >= first
-            r = renewed(column_of_rod)
+            r = wp.max(renewed(rod), 0)
+            k = index_of(j, n)
+            column = column_of(inputs, r, wp.min(k, count_of(inputs, r) - 1))
+            stencil = ahead
+            read = stencil_at(inputs, j + wp.static(0 if serial else 1), n, r)
+            if wp.static(serial):
+                stencil = read
+            else:
+                ahead = read
+            inertia = mass[k, r]
+            goal = target[k, r]
+            step = H()
+            for d in range(wp.static(nb)):
+                step[d] = direction[d, k, r]
+            mask = int(fixed[k, r])
+            energy_before = results.energy[accepted, column]
+            spin = real(0.0)
+            goal_angle = real(0.0)
+            if wp.static(twist):
+                spin = rotary[k, r]
+                goal_angle = target_angle[k, r]
+            far = P()
+            if wp.static(prepared):
+                if wp.static(closed) or j < n - 2:
+                    far = edge(stencil.x - next_position, stencil.u, stencil.t, stencil.theta)
             energy = real(0.0)
             g = W()
             stiff = real(0.0)
-            column = column_of(inputs, r, k)
-            if k < count_of(inputs, r):
+            if j >= start and k < count_of(inputs, r):
                 frozen = not owned or (wp.static(reuse) and iteration > 0)
                 whole = whole_of(inputs, r, k)
-                if wp.static(prepared):
-                    q = window(inputs.x, inputs.theta, k, n, whole, r)
-                    s = L()
-                    for row in range(wp.static(EDGE)):
-                        s[row] = near[row]
-                    if whole:
-                        near = prepared_edge(inputs, V(q[3], q[4], q[5]), q[7], along(k + 1, n), r)
-                    for row in range(wp.static(EDGE)):
-                        s[wp.static(EDGE) + row] = near[row]
-                    s[wp.static(2 * EDGE)] = inputs.frame[6, k, r]
+                if wp.static(by_window):
+                    q, s = window_of(inputs, r, k, whole)
                 else:
-                    q, s = read(inputs, r, k, whole)
+                    q = W()
+                    s = L()
+                    for d in range(wp.static(dim)):
+                        q[d] = next_position[d] - position[d]
+                        if wp.static(span == 2):
+                            q[wp.static(dim) + d] = stencil.x[d] - next_position[d]
+                    if wp.static(prepared):
+                        q[wp.static(angle)] = theta
+                        q[wp.static(angle + 1)] = stencil.theta
+                        for row in range(wp.static(EDGE)):
+                            s[row] = near[row]
+                            s[wp.static(EDGE) + row] = far[row]
+                        s[wp.static(2 * EDGE)] = stencil.lagged_twist
                 energy, g, stiff = element_at(
                     inputs, flags, results, q, s, whole, clamped, frozen, exact and owned, carried, r, k, column
                 )
@@ -222,21 +275,13 @@ def evaluate_kernel(
             if wp.static(twist):
                 elastic = g[wp.static(angle)] + moment_ahead
             if owned:
-                r = renewed(r)
-                # read here, not before the loop, where they would occupy registers of the elements
-                c = scalars[INERTIA_COEFFICIENT, r]
-                taken = scalars[STEP_LENGTH, r]
-                limit = rtol * scalars[LOAD_SCALE, r]
-                if iteration == 0 or taken < real(1.0):
-                    limit /= real(n)
-                position = inputs.x[k, r]
                 if wp.static(drag):
-                    m = mass[k, r].mass
+                    m = inertia.mass
                 else:
-                    m = mass[k, r]
-                f = gravity[0] * m - (position - target[k, r]) * (c * m)
+                    m = inertia
+                f = gravity[0] * m - (position - goal) * (c * m)
                 if wp.static(drag):
-                    f -= mass[k, r].resistance * (position - mass[k, r].carried)
+                    f -= inertia.resistance * (position - inertia.carried)
                 moment = real(0.0)
                 if loaded != 0:
                     f += load[k, r]
@@ -246,13 +291,12 @@ def evaluate_kernel(
                 f -= force_behind
                 size = wp.max(wp.abs(force)) + wp.max(wp.abs(force_behind))
                 if wp.static(twist):
-                    moment -= elastic + c * rotary[k, r] * (inputs.theta[k, r] - target_angle[k, r])
+                    moment -= elastic + c * spin * (theta - goal_angle)
                 stiffest = wp.max(stiff, stiff_behind)
                 magnitude = wp.max(wp.abs(position))
                 least = rounding_factor * ((real(2.0) * stiffest + c * m) * magnitude + size)
                 if wp.static(drag):
-                    least += rounding_factor * wp.max(wp.get_diag(mass[k, r].resistance)) * magnitude
-                mask = int(fixed[k, r])
+                    least += rounding_factor * wp.max(wp.get_diag(inertia.resistance)) * magnitude
                 if wp.static(real is wp.float32):
                     doubtful = real(wp.static(ROUNDED)) * scalars[LOAD_SCALE, r]
                     settled = real(wp.static(SETTLED)) * length[r]
@@ -264,30 +308,30 @@ def evaluate_kernel(
                         if not wp.abs(f[d]) <= least:
                             flags[NOT_CONVERGED, r] = 1
                         if wp.static(real is wp.float32):
-                            if wp.abs(f[d]) > doubtful and not wp.abs(real(direction[d, k, r])) < settled:
+                            if wp.abs(f[d]) > doubtful and not wp.abs(real(step[d])) < settled:
                                 flags[DOUBTFUL, r] = 1
                 if wp.static(twist):
                     is_fixed = ((mask >> wp.static(dim)) & 1) == 1
                     right_out[wp.static(nb - 1), k, r] = linear(wp.where(is_fixed, real(0.0), moment))
                     if not is_fixed and not wp.abs(moment) <= limit * length[r]:
                         flags[BELOW_ROUNDING_FLOOR, r] = 1
-                        arm = wp.length(inputs.x[along(k + 1, n), r] - position)
+                        arm = wp.length(next_position - position)
                         least = rounding_factor * (
                             real(2.0) * stiffest * arm * arm * magnitude / length[r]
-                            + c * rotary[k, r] * (real(1.0) + wp.abs(inputs.theta[k, r]))
+                            + c * spin * (real(1.0) + wp.abs(theta))
                             + wp.abs(elastic)
                         )
                         if not wp.abs(moment) <= least:
                             flags[NOT_CONVERGED, r] = 1
                         if wp.static(real is wp.float32):
-                            rotation = wp.abs(real(direction[wp.static(nb - 1), k, r]))
+                            rotation = wp.abs(real(step[wp.static(nb - 1)]))
                             if wp.abs(moment) > doubtful * length[r] and not rotation < real(wp.static(SETTLED)):
                                 flags[DOUBTFUL, r] = 1
                 if iteration != 0:
                     change_here = real(0.0)
                     rounding_here = real(0.5) * size * magnitude
                     if k < count_of(inputs, r):
-                        change_here = energy - results.energy[accepted, column]
+                        change_here = energy - energy_before
                         rounding_here += wp.abs(energy)
                     # energy change of inertia and loads along the step, from products of small differences
                     u = V()
@@ -295,25 +339,24 @@ def evaluate_kernel(
                         u = position - base[k, r]
                     else:
                         for d in range(wp.static(dim)):
-                            u[d] = taken * real(direction[d, k, r])
+                            u[d] = taken * real(step[d])
                     outer = gravity[0] * m
                     if loaded != 0:
                         outer += load[k, r]
-                    work = wp.dot(u, (position - target[k, r] - u * real(0.5)) * (c * m) - outer)
+                    work = wp.dot(u, (position - goal - u * real(0.5)) * (c * m) - outer)
                     if wp.static(drag):
-                        work += wp.dot(u, mass[k, r].resistance * (position - mass[k, r].carried - u * real(0.5)))
+                        work += wp.dot(u, inertia.resistance * (position - inertia.carried - u * real(0.5)))
                     if wp.static(twist):
-                        rotation_step = taken * real(direction[wp.static(nb - 1), k, r])
-                        work += (
-                            rotation_step
-                            * c
-                            * rotary[k, r]
-                            * (inputs.theta[k, r] - target_angle[k, r] - real(0.5) * rotation_step)
-                        )
+                        rotation_step = taken * real(step[wp.static(nb - 1)])
+                        work += rotation_step * c * spin * (theta - goal_angle - real(0.5) * rotation_step)
                         if loaded != 0:
                             work -= rotation_step * load_angle[k, r]
                     change += change_here + work
                     rounding_error += rounding_here + wp.abs(work)
+            position = next_position
+            next_position = stencil.x
+            theta = stencil.theta
+            near = far
             force_behind = force
             stiff_behind = stiff
             if wp.static(span == 2):

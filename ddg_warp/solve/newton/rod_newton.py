@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import warp as wp
 
 from ddg_warp import argument_checks, device_arrays
@@ -18,10 +19,7 @@ FIRST_EXACT_ITERATION = 2  # Gauss-Newton iterations of "progressive": far from 
 PSD_MODES = ("auto", "gauss_newton", "project", "progressive", "none")
 FROZEN = ("auto", "gauss_newton")  # `psd` modes of a frozen Hessian
 FROZEN_ONLY = "psd {!r}: the solver 'projective' freezes the matrix of 'gauss_newton'"
-RUN_THREADS, LONGEST_RUN = (
-    50_000,
-    16,
-)  # least threads of an evaluation on a GPU, if nodes suffice, and most nodes of one
+RESIDENT = 256  # threads of an evaluation that a multiprocessor runs at once
 FEW = 20_000  # rods up to which a GPU eliminates from both ends
 MANY = 50_000  # rods from which full blocks of the sweep pay on a GPU; below, small ones reach more multiprocessors
 
@@ -304,7 +302,14 @@ class RodNewton:
 
 
 def _run(group) -> int:
-    """Return the nodes that a thread evaluates: on a GPU few, so that all multiprocessors have work."""
+    """Return the nodes that a thread evaluates: all on the CPU, on a GPU those with which all threads end first.
+
+    Threads run in waves, and each also evaluates the elements before its run.
+    """
     if group.kind.serial:
         return group.nodes
-    return min(max(1, group.nodes * group.columns // RUN_THREADS), LONGEST_RUN, group.nodes)
+    resident = group.device.sm_count * RESIDENT
+    runs = np.arange(1, group.nodes + 1)
+    nodes = -(-group.nodes // runs)
+    waves = -(-group.columns * runs // resident)
+    return int(nodes[np.argmin(waves * (nodes + np.where(runs > 1, group.kind.span, 0) + 1))])
