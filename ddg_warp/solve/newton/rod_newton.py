@@ -308,7 +308,7 @@ def _run(group) -> int:
     """
     if group.kind.serial:
         return group.nodes
-    resident = group.device.sm_count * RESIDENT
+    resident = wp.get_device(group.device).sm_count * RESIDENT
     runs = np.arange(1, group.nodes + 1)
     nodes = -(-group.nodes // runs)
     waves = -(-group.columns * runs // resident)
