@@ -9,6 +9,8 @@ import pytest
 import warp as wp
 
 import ddg_warp as ddg
+from ddg_warp.compile import memory
+from ddg_warp.postprocess import model_report
 
 TWIST = ("transport(", "reference_twist(", "rotate(", "relag", "atan2(")
 HEAVY = ("warp", "torch", "pxr", "h5py", "scipy", "matplotlib")
@@ -66,7 +68,7 @@ def test_springs_have_no_angles_and_no_frames(device):
     assert data.x.shape == data.v.shape == (6, 1)
     newton = integrator._rod_steps[0].newton
     assert newton.direction.shape[0] == 3
-    assert newton.elimination.shape[0] == 9 + 3
+    assert newton.elimination.shape[0] == 9
     assert newton.iterates.theta.size == newton.iterates.target_angle.size == 1
     assert state.points()[-1, 2] < 0.0  # it falls
 
@@ -161,3 +163,32 @@ def test_describing_a_scene_needs_no_warp():
     )
     output = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert not {name.split(".")[0] for name in output.split()} & set(HEAVY)
+
+
+@pytest.mark.parametrize("options", [{}, {"twist": False}, {"bend": False}, {"dimension": 2}], ids=str)
+@pytest.mark.parametrize("precision", ["float64", "mixed"])
+def test_report_states_the_memory_of_a_node(device, options, precision):
+    """The report states the bytes of all arrays of states and solver, and no build is refused that would fit."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, -9.81), dimension=options.get("dimension", 3))
+    points = np.zeros((5, 16, 3))
+    points[..., 0] = np.linspace(0.0, 1.0, 16)
+    kind = {"section": ddg.Circle(2e-3), "material": ddg.Material(young=1e7, poisson=0.5, density=1000.0)}
+    scene.clamp(
+        scene.add_rods(points, **kind, **{key: value for key, value in options.items() if key != "dimension"}),
+        edges=[0],
+    )
+    model = scene.build(device, precision)
+    integrator = ddg.Integrator(model)
+    state = integrator.step(model.state(), 1e-3)
+    (step,), (group,) = integrator._rod_steps, model.groups
+    newton = step.newton
+    arrays = [group.mass, group.rotary, group.fixed, newton.rhs, newton.direction, newton.elimination]
+    arrays += [*newton.islands.arrays, step._predicted, step._predicted_angle]
+    arrays += [*vars(newton.iterates).values(), *vars(newton.elements).values()]
+    sizes = {array.ptr: array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays if array.size > 1}
+    of_state = [array for array in state.groups[0].arrays().values() if array.size > 1]
+    sizes["states"] = 2 * sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in of_state)
+    stated = model_report.bytes_per_node(model, group)
+    assert f"memory: {stated} bytes a node" in model.report()
+    assert sum(sizes.values()) / points[..., 0].size == pytest.approx(stated, abs=2.0)
+    assert memory._rod_bytes(scene, precision) <= stated * points[..., 0].size

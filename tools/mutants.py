@@ -129,8 +129,8 @@ FAULTS = (
     Fault(
         "residual: sign of rotary inertia",
         "kernels/residual/rod_residual.py",
-        "moment -= elastic + c * rotary[k, r]",
-        "moment -= elastic - c * rotary[k, r]",
+        "moment -= elastic + c * spin * (theta",
+        "moment -= elastic - c * spin * (theta",
         ("tests/kernels/test_chain.py", "tests/linear/test_partitioned.py"),
     ),
     Fault(

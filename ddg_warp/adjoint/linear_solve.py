@@ -183,7 +183,7 @@ class DirectSolve:
         few = automatic(group) == "cyclic_reduction"
         if not few and not kind.closed and linear is None:
             self.solver, self.system = None, RodNewton(*arguments)
-            self._moved, self._residual = self.system.iterates, self.system.rhs  # the sweep moves the former along w
+            self._moved = self.system.iterates  # with arrays that the sweep moves along w
             self.failed = self.system.islands.status
             return
         self.system = AssembledNewton(*arguments, stored=linear)
@@ -220,12 +220,11 @@ class DirectSolve:
         if resisted:
             adjoint, *states = resisted
             adjoint.drag.resist(*states, loading.mass, loading.rotary, system.iterates.target_angle, islands)
-        if self.solver is None:
-            system.rhs = self._residual
         system.evaluate(last)
         if self.solver is None:
             islands.frames_outdated.zero_()  # keep the frames of the step
-            system.iterates, system.rhs, system.direction = self._moved, rhs, w
+            system.iterates, system.direction = self._moved, w
+            device_arrays.copy(system.rhs, rhs)  # the sweep overwrites it
             device_arrays.copy(system.iterates.x, solved.x)
             device_arrays.copy(system.iterates.theta, solved.theta)
             system.eliminate()

@@ -6,10 +6,11 @@ from pathlib import Path
 
 from ddg_warp.errors import SceneError, SolverError
 
-# Least bytes of a dof block in float64, constant arrays, states and solver together: of uncoupled rods and of the coupled system.
-#
-# Measured: 600 to 750 for uncoupled rods, 1340 (joined rods) to 3360 (contact).
-ROD_GROUPS, COUPLED = 550, 1300
+# Least bytes of a node of uncoupled rods, constant arrays, states and solver together: planar, without twist, and with twist. They are
+# those of rods that only stretch, and of straight rods with twist; see `postprocess.model_report.bytes_per_node`.
+ROD_NODE = {"float64": (260, 400, 810), "mixed": (225, 335, 660), "float32": (130, 200, 400)}
+# Least bytes of a dof block of the coupled system in float64. Measured: 1340 (joined rods) to 3360 (contact).
+COUPLED = 1300
 # Fraction of these bytes by precision; measured: 0.58 to 0.81 in mixed precision.
 LESS = {"float64": 1.0, "mixed": 0.6, "float32": 0.5}
 MOST = 2**31 - 1  # largest index on a device
@@ -27,7 +28,7 @@ def require(scene, is_coupled: bool, worlds: int, precision: str, device) -> Non
             f"worlds = {worlds}: indices on a device count to {MOST}, and each world has {blocks} nodes and angles; build "
             f"{MOST // blocks} worlds at most, in several models if need be"
         )
-    each = blocks * (COUPLED if is_coupled else ROD_GROUPS) * LESS[precision]
+    each = blocks * COUPLED * LESS[precision] if is_coupled else _rod_bytes(scene, precision)
     free = free_bytes(device)
     if worlds * each > free:
         fits = int(free // each)
@@ -72,6 +73,13 @@ def _blocks(scene) -> int:
     """Return the number of nodes and twist angles in a world."""
     rods = sum(batch.rods * batch.nodes * (2 if batch.twist else 1) for batch in scene.batches)
     return rods + sum(len(shell.points) for shell in (*scene.shells, *scene.axisymmetric_shells))
+
+
+def _rod_bytes(scene, precision: str) -> int:
+    """Return the least bytes of the uncoupled rods of a world."""
+    planar, untwisted, twisted = ROD_NODE[precision]
+    straight = planar if scene.dimension == 2 else untwisted
+    return sum(batch.rods * batch.nodes * (twisted if batch.twist else straight) for batch in scene.batches)
 
 
 def _entry(path: str, name: str) -> float:

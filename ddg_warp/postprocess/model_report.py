@@ -4,7 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ddg_warp.kernels.core.islands import FLAGS, SCALARS
 from ddg_warp.kernels.linear import cyclic_reduction, rod_elimination
+from ddg_warp.kernels.newton import rod_sweep
 from ddg_warp.kernels.terms import ALL, FRICTION, Potential, contact_potential
 from ddg_warp.scene.material import DRAWN
 from ddg_warp.scene.obstacles import BALL, MESH, PLANE
@@ -12,6 +14,7 @@ from ddg_warp.scene.scene import Dynamics
 from ddg_warp.solve.linear.rod_substructuring import RodSubstructuring
 from ddg_warp.solve.linear.solver_selection import automatic, coupled_preconditioner
 from ddg_warp.solve.linear.sparse_system import SparseSystem
+from ddg_warp.solve.newton.rod_newton import has_natural_curvature, swept_ends
 from ddg_warp.solve.stepping.decoupled_step import uncoupled
 from ddg_warp.solve.stepping.step_driver import LinearSolverChoice, choose_solver
 
@@ -147,19 +150,24 @@ def coupled_lines(model) -> list[str]:
 
 
 def bytes_per_node(model, group) -> int:
-    """Return device memory of states, iterate and solver for one node of a rod group."""
-    kind, nb = group.kind, group.kind.block
+    """Return device memory for one node of a rod group: constants, two states, and the usual solver of its steps."""
+    kind, nb, twist = group.kind, group.kind.block, group.kind.twist
     real, linear = (4 if t.__name__ == "float32" else 8 for t in (model.types.real, model.types.linear))
-    state = 2 * kind.dim + (9 if kind.twist else 0) + (kind.strain_rows if kind.viscous else 0)
-    iterate = 2 * kind.dim + (9 if kind.twist else 0) + kind.window + 2
-    solver = kind.factor_rows + 2 * nb + 1
+    state = 3 * kind.dim + (10 if twist else 0) + (kind.strain_rows if kind.viscous else 0)
+    iterate = 4 * kind.dim + (10 if twist else 0) + 2  # with predictor and energies
+    factor, solver = kind.factor_rows, 2 * nb + 1
+    if has_natural_curvature(group) and kind.span == 2:
+        solver += kind.geometric_rows
     constant = 2 * real + 1
     if kind.closed:
         solver += 3 * nb**2 + rod_elimination.kept_rows(kind)
     elif automatic(group) == "sweep":
-        solver += 2 * nb**2
+        sides = swept_ends(group)
+        kept = rod_sweep.kept_rows(kind, sides=sides)
+        factor = max(factor, kept) if sides == 1 else factor + kept
     else:
-        iterate += kind.dim + (7 if kind.twist else 0) + 2
+        iterate += kind.dim + (7 if twist else 0) + 2
         solver += 3 * nb**2 + nb + sum(cyclic_reduction.level_rows(nb)) // 2
         constant += 8
-    return 2 * state * real + iterate * real + solver * linear + constant
+    islands = (4 * len(FLAGS) + real * len(SCALARS)) // group.nodes
+    return 2 * state * real + iterate * real + (factor + solver) * linear + constant + islands

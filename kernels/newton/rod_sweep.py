@@ -52,9 +52,9 @@ from ddg_warp.kernels.newton.rod_iterate import ROTATE_EDGES, UPDATE_FRAMES, sho
 
 @cache
 def kept_rows(kind: RodKind, mixed_axial: bool = False, sides: int = 1) -> int:
-    """Return the number of reals of an eliminated node: U, the columns of V that may be nonzero, y, and data of tensions."""
+    """Return the number of reals of an eliminated node: U, the columns of V that may be nonzero, and data of tensions."""
     nb = kind.block
-    return nb**2 + nb * _far_columns(kind, sides) + nb + (mixed_axial_force.kept_rows(nb) if mixed_axial else 0)
+    return nb**2 + nb * _far_columns(kind, sides) + (mixed_axial_force.kept_rows(nb) if mixed_axial else 0)
 
 
 def _far_columns(kind: RodKind, sides: int) -> int:
@@ -69,7 +69,10 @@ def _far_columns(kind: RodKind, sides: int) -> int:
 
 @cache
 def data_type(kind: RodKind, real, linear):
-    """Return the struct of the arrays of a sweep: elements, residual, inertia, iterate, kept data and direction."""
+    """Return the struct of the arrays of a sweep: elements, residual, inertia, iterate, kept data and direction.
+
+    The elimination replaces the residual of a node by y, the direction that it would have alone.
+    """
     V, Inertia = wp.types.vector(kind.dim, real), inertia_type(kind, real)
 
     @wp.struct
@@ -110,8 +113,7 @@ def eliminate_function(kind: RodKind, real, linear, exact_from: int | None, mixe
     # Measured: in float64 prefetching takes more registers than a GPU has; 10 % slower on an H200.
     prefetch = kind.serial or linear == wp.float32
     columns = _far_columns(kind, sides)
-    solution_row = nb2 + nb * columns  # row of the kept data where y begins
-    tension_row = solution_row + nb
+    tension_row = nb2 + nb * columns  # row of the kept data where tensions begin
     Pending, eliminate_tension = mixed_axial_force.functions(nb, linear)
     vertex_rows, edge_rows, tensions = kind.vertex_strains, kind.edge_strains, kind.tensions
     exact, begin_exact = exact_from is not None, exact_from or 0
@@ -280,7 +282,7 @@ def eliminate_function(kind: RodKind, real, linear, exact_from: int | None, mixe
             newton += real(wp.dot(wp.cw_mul(z, inverse), z))
             y = upper_vector(L, inverse, z)
             if wp.static(not mixed_axial):
-                store_vector(data.kept, wp.static(solution_row), k, r, y)
+                store_vector(data.rhs, 0, k, r, y)
             Zb = lower(L, Wab)
             if wp.static(not mixed_axial):
                 store(data.kept, 0, k, r, upper(L, inverse, Zb))
@@ -315,7 +317,7 @@ def eliminate_function(kind: RodKind, real, linear, exact_from: int | None, mixe
                     store(data.kept, 0, k, r, upper(L, inverse, Zb) + wp.outer(out.behind, near))
                     store_far(data.kept, k, r, upper(L, inverse, Zc) + wp.outer(out.behind, far))
                     q = out.coupling * out.weight
-                    store_vector(data.kept, wp.static(solution_row), k, r, y)
+                    store_vector(data.rhs, 0, k, r, y)
                     store_vector(data.kept, wp.static(tension_row), k, r, out.ahead + out.behind * q)
                     store_vector(data.kept, wp.static(tension_row + nb), k, r, near)
                     store_vector(data.kept, wp.static(tension_row + 2 * nb), k, r, far)
@@ -452,12 +454,12 @@ def substitute_function(kind: RodKind, real, linear, mixed_axial: bool, sides: i
     Data = data_type(kind, real, linear)
     dim, nb, twist, span, nb2, angle = kind.dim, kind.block, kind.twist, kind.span, kind.block**2, kind.block - 1
     V, H, columns = wp.types.vector(dim, real), wp.types.vector(nb, linear), _far_columns(kind, sides)
-    solution_row = nb2 + nb * columns
-    tension_row, slack_row = solution_row + nb, kind.factor_rows
+    tension_row, slack_row = nb2 + nb * columns, kind.factor_rows
     prefetch = kind.serial or linear == wp.float32
     longer = mixed_axial_force.longer_function(dim, real, linear)
     size = kept_rows(kind, mixed_axial, sides)
     kept, left_at, times, times_far = prefetch_functions(nb, linear, size, prefetch, columns)
+    _, _, vector, store_vector = block_functions(nb, linear)
 
     @wp.struct
     class Ahead:
@@ -486,6 +488,7 @@ def substitute_function(kind: RodKind, real, linear, mixed_axial: bool, sides: i
             axial_force = linear(0.0)
             per_root = linear(real(1.0) / wp.sqrt(scalars[MAX_EDGE_STIFFNESS, r]))
         left = kept(data.kept, start, r)
+        y = vector(data.rhs, 0, start, r)
         x_j = data.x[start, r]
         twist_angle = real(0.0)
         if wp.static(twist):
@@ -494,6 +497,7 @@ def substitute_function(kind: RodKind, real, linear, mixed_axial: bool, sides: i
             j = start + i * stride
             before = start + wp.min(i + 1, number - 1) * stride
             left_before = kept(data.kept, before, r)
+            y_before = vector(data.rhs, 0, before, r)
             x_before = data.x[before, r]
             twist_angle_before = real(0.0)
             if wp.static(twist):
@@ -511,9 +515,8 @@ def substitute_function(kind: RodKind, real, linear, mixed_axial: bool, sides: i
                     tension_behind += left_at(left, data.kept, wp.static(tension_row + 2 * nb) + d, j, r) * e2[d]
                 axial_force = next_axial_force
                 next_axial_force = tension_behind
-            for d in range(wp.static(nb)):
-                step[d] = step[d] + left_at(left, data.kept, wp.static(solution_row) + d, j, r)
-                data.direction[d, j, r] = step[d]
+            step += y
+            store_vector(data.direction, 0, j, r, step)
             dx = V()
             bent = V()
             for d in range(wp.static(dim)):
@@ -532,6 +535,7 @@ def substitute_function(kind: RodKind, real, linear, mixed_axial: bool, sides: i
             e2 = e1
             e1 = step
             left = left_before
+            y = y_before
             x_j = x_before
             twist_angle = twist_angle_before
         out = Ahead()

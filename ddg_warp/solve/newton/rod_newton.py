@@ -130,9 +130,8 @@ class RodNewton:
         self._prepare_sweep(mixed_axial)
 
     def _sides(self, mixed_axial: bool) -> int:
-        """Return the ends of a rod from which a sweep eliminates at once: few rods give too few threads otherwise."""
-        group = self.group
-        return 1 if group.kind.serial or mixed_axial or group.columns > FEW else 2
+        """Return the number of ends of a rod from which a sweep eliminates at once."""
+        return 1 if mixed_axial else swept_ends(self.group)
 
     def _prepare_sweep(self, mixed_axial: bool) -> None:
         """Allocate the data of eliminated nodes, and build the kernels of an iteration."""
@@ -155,9 +154,7 @@ class RodNewton:
 
     def automatic_psd(self) -> str:
         """Return the mode of `NewtonOptions.psd` that suits the rods: Gauss-Newton lacks the effect of natural curvature on roll."""
-        group = self.group
-        rest = [f"{term.name}.{name}" for term in group.kind.terms if term.measure.span == 2 for name in term.rest]
-        return "progressive" if any(map(group.parameters.may_be_other_than_zero, rest)) else "gauss_newton"
+        return "progressive" if has_natural_curvature(self.group) else "gauss_newton"
 
     @property
     def outdated(self) -> bool:
@@ -299,6 +296,17 @@ class RodNewton:
         data.count, data.fixed, data.mass, data.rotary = group.count, group.fixed, loading.mass, loading.rotary
         data.x, data.theta = iterates.x, iterates.theta
         return data
+
+
+def has_natural_curvature(group) -> bool:
+    """Return True if rods of a group may be curved or twisted at rest."""
+    rest = [f"{term.name}.{name}" for term in group.kind.terms if term.measure.span == 2 for name in term.rest]
+    return any(map(group.parameters.may_be_other_than_zero, rest))
+
+
+def swept_ends(group) -> int:
+    """Return the number of ends of a rod from which a sweep eliminates at once: few rods give too few threads otherwise."""
+    return 1 if group.kind.serial or group.columns > FEW else 2
 
 
 def _run(group) -> int:
