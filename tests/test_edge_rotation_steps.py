@@ -318,7 +318,7 @@ def test_projected_limit_skips_the_cold_start(device, result, projected, again):
     islands.substep_fraction.fill_(1.0)
     counts = [wp.zeros(16, dtype=wp.int64, device=device) for _ in range(2)]
     remaining = wp.zeros(1, dtype=int, device=device)
-    inputs = [*islands.arrays, 20, 2.0**-10, outcome.CONVERGED_TO_ROUNDING, *counts, remaining]
+    inputs = [1, *islands.arrays, 20, 2.0**-10, outcome.CONVERGED_TO_ROUNDING, *counts, remaining]
     wp.launch(advance_kernel(real), 1, inputs, device=device)
     assert (islands.cold_start.numpy()[0], islands.substep_fraction.numpy()[0]) == ((1, 1.0) if again else (0, 0.5))
     assert remaining.numpy()[0] == 1

@@ -7,7 +7,8 @@ forces on the first nodes. A rod has converged if at every free dof
 
     |residual| <= max(rtol * load scale, floor) ,   floor = floor_factor * eps * (H_ii |x| + sum of |element forces|) ,
 
-where the floor bounds the rounding of coordinates and forces. Moments are compared over the length of the rod. Sums of residuals
+where the floor bounds the rounding of coordinates and forces, and |x| is the largest coordinate of the node and of the next one, whose
+edge is as exact as that. Moments are compared over the length of the rod. Sums of residuals
 have to be small, too; see `compile.residual_tolerance`. After a full Newton step they are, of second order. At the start, or after a
 shortened step, the limit is divided by the number of nodes instead.
 """
@@ -296,7 +297,8 @@ def evaluate_kernel(
                 if wp.static(twist):
                     moment -= elastic + c * spin * (theta - goal_angle)
                 stiffest = wp.max(stiff, stiff_behind)
-                magnitude = wp.max(wp.abs(position))
+                # an edge is as exact as the larger one of its ends
+                magnitude = wp.max(wp.max(wp.abs(position)), wp.max(wp.abs(next_position)))
                 least = rounding_factor * ((real(2.0) * stiffest + c * m) * magnitude + size)
                 if wp.static(drag):
                     least += rounding_factor * wp.max(wp.get_diag(inertia.resistance)) * magnitude
