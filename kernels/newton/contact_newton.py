@@ -218,7 +218,7 @@ def contact_kernels(real, linear, serial: bool):
 def limit_kernels(real, serial: bool):
     """Build the kernels of step fractions.
 
-    `modes`, `predicted`: choose the motion mode of an update or a predictor.
+    `modes`, `predicted`: choose the motion mode of an update or a predictor, and reset or advance the state of moving supports.
     `stay`: write starts and proposed ends of motions; choose one fraction for long ones.
     `near`: shorten long motions.
     `less`: correct the fraction of a motion that was shortened before CCD.
@@ -228,20 +228,40 @@ def limit_kernels(real, serial: bool):
     first_item, until = items_function(serial), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def modes(flags: wp.array2d(dtype=int), modes_out: wp.array(dtype=int), longest_out: wp.array(dtype=real)):
-        """Choose modes: one fraction for updates that the line search has shortened, so that short ones descend. Reset `longest`."""
+    def modes(
+        flags: wp.array2d(dtype=int),
+        modes_out: wp.array(dtype=int),
+        longest_out: wp.array(dtype=real),
+        going: wp.array(dtype=int),
+    ):
+        """Choose modes: one fraction for updates that the line search has shortened, so that short ones descend.
+
+        Reset `longest` and `going`, and advance the state of moving supports.
+        """
         w = wp.tid()
+        if w == 0:
+            going[0] = 0
         longest_out[w] = real(0.0)
         modes_out[w] = wp.static(NONE)
         if flags[ITERATE_ACTION, w] == wp.static(ROTATE_EDGES) or flags[ITERATE_ACTION, w] == wp.static(MOVE_STRAIGHT):
             modes_out[w] = wp.where(
                 flags[BACKTRACKS, w] > 0, int(wp.static(SINGLE_FRACTION)), int(wp.static(PER_BODY_FRACTION))
             )
+            flags[SUPPORT_MOTION_PENDING, w] = wp.where(
+                flags[SUPPORT_MOTION_PENDING, w] == wp.static(SUPPORTS_MOVING), int(wp.static(SUPPORTS_ARRIVED)), int(0)
+            )
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def predicted(flags: wp.array2d(dtype=int), modes_out: wp.array(dtype=int), longest_out: wp.array(dtype=real)):
+    def predicted(
+        flags: wp.array2d(dtype=int),
+        modes_out: wp.array(dtype=int),
+        longest_out: wp.array(dtype=real),
+        going: wp.array(dtype=int),
+    ):
         """Choose modes of predictors, in worlds that take the step."""
         w = wp.tid()
+        if w == 0:
+            going[0] = 0
         longest_out[w] = real(0.0)
         modes_out[w] = wp.where(
             flags[SUBSTEP_ACCEPTED, w] != 0, int(wp.static(PER_BODY_FRACTION)), int(wp.static(NONE))
@@ -322,7 +342,6 @@ def pending_kernels(real, linear, serial: bool):
     """Build the kernels of pending motion.
 
     `aim`: store the prescribed positions of supports.
-    `depart`: advance the state of moving supports.
     `land`: put supports at the end of a full step.
     `arrive`: put supports at prescribed positions, or mark the world as moving.
     `part`: discard proposed motions that have ended.
@@ -339,14 +358,6 @@ def pending_kernels(real, linear, serial: bool):
     def aim(nodes: wp.array(dtype=int), blocks: int, q: wp.array(dtype=V), aims_out: wp.array2d(dtype=V)):
         i, w = wp.tid()
         aims_out[i, w] = q[nodes[i] + w * blocks]
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def depart(modes: wp.array(dtype=int), flags: wp.array2d(dtype=int)):
-        w = wp.tid()
-        if modes[w] != wp.static(NONE):
-            flags[SUPPORT_MOTION_PENDING, w] = wp.where(
-                flags[SUPPORT_MOTION_PENDING, w] == wp.static(SUPPORTS_MOVING), int(wp.static(SUPPORTS_ARRIVED)), int(0)
-            )
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def land(
@@ -469,4 +480,4 @@ def pending_kernels(real, linear, serial: bool):
             for k in range(start, until(start, blocks)):
                 direction[k + w * blocks] += remainder[k + w * blocks]
 
-    return aim, depart, land, arrive, part, remainder, push, lessen, add
+    return aim, land, arrive, part, remainder, push, lessen, add

@@ -23,34 +23,43 @@ LINE = 32  # integers of a cache line, which has one counter
 
 
 class RunningSums:
-    """Exclusive prefix sum of some integers, in `starts`."""
+    """Exclusive prefix sum of some integers.
 
-    def __init__(self, values: wp.array):
-        self._levels = [values]
-        self.kernels = [prefix_sum.run]
-        if values.device.is_cuda:
-            self.kernels = [(prefix_sum.add_tiles, prefix_sum.THREADS), (prefix_sum.run_tiles, prefix_sum.THREADS)]
-            while len(self._levels[-1]) > prefix_sum.TILE:
-                tiles = -(-len(self._levels[-1]) // prefix_sum.TILE)
-                self._levels.append(wp.zeros(tiles, dtype=int, device=values.device))
-        self._starts = [wp.zeros_like(level) for level in self._levels]
-        self._first = wp.zeros(1, dtype=int, device=values.device)
-        self.starts = self._starts[0]
+    Args:
+        values: the integers.
+        tiles: zeroed memory for the sums of tiles, `tiles_of` of the integers; by default its own.
+
+    Attributes:
+        starts: the prefix sum.
+        tiles: sums of tiles, to be written with the integers; see `kernels.core.prefix_sum`. Empty on the CPU.
+    """
+
+    def __init__(self, values: wp.array, tiles: wp.array | None = None):
+        self._values, self.starts, cuda = values, wp.zeros_like(values), values.device.is_cuda
+        self.kernels = [(prefix_sum.run_tiles, prefix_sum.THREADS)] if cuda else [prefix_sum.run]
+        if tiles is None or not cuda:
+            tiles = wp.zeros(tiles_of(len(values)) if cuda else 0, dtype=int, device=values.device)
+        self.tiles = tiles
 
     def __call__(self) -> None:
-        if not self.starts.device.is_cuda:
-            wp.launch(prefix_sum.run, 1, [self._levels[0]], [self.starts], device=self.starts.device)
-            return
-        for values, tiles in zip(self._levels, self._levels[1:], strict=False):
-            self._launch(prefix_sum.add_tiles, len(tiles), [values], [tiles])
-        before = self._first
-        for values, starts in zip(reversed(self._levels), reversed(self._starts), strict=True):
-            self._launch(prefix_sum.run_tiles, len(before), [values, before], [starts])
-            before = starts
-
-    def _launch(self, kernel, tiles: int, inputs: list, outputs: list) -> None:
         device = self.starts.device
-        wp.launch_tiled(kernel, dim=tiles, inputs=inputs, outputs=outputs, block_dim=prefix_sum.THREADS, device=device)
+        if not device.is_cuda:
+            wp.launch(prefix_sum.run, 1, [self._values], [self.starts], device=device)
+            return
+        inputs, threads = [self._values, self.tiles], prefix_sum.THREADS
+        wp.launch_tiled(
+            prefix_sum.run_tiles,
+            dim=len(self.tiles),
+            inputs=inputs,
+            outputs=[self.starts],
+            block_dim=threads,
+            device=device,
+        )
+
+
+def tiles_of(count: int) -> int:
+    """Return the number of tiles of a prefix sum of `count` integers."""
+    return -(-count // prefix_sum.TILE)
 
 
 class CandidateList:
@@ -94,8 +103,14 @@ class CandidateList:
         self.trees.tree = second.leaves.tree.id
         if first.order is not None:
             self.trees.order = first.order.numbers
-        self._last, self.partners = (wp.zeros(first.all, dtype=int, device=self.device) for _ in range(2))
-        self._sums = RunningSums(self.partners)
+        parts = 1 if device_arrays.serial(self.device) else min(max(first.leaves.all // LEAST, 1), PARTS)
+        lines = parts * LINE
+        counts = lines + first.all + tiles_of(first.all)
+        self._counts = wp.zeros(counts, dtype=int, device=self.device)  # zeroed at once
+        self._counters, self.partners = self._counts[:lines], self._counts[lines : lines + first.all]
+        self._found = self._counters.reshape((parts, LINE))[:, 0]
+        self._last = wp.zeros(first.all, dtype=int, device=self.device)
+        self._sums = RunningSums(self.partners, self._counts[lines + first.all :])
         self.starts = self._sums.starts
         self._wide = wp.vec2i(first.bundle, second.bundle)
         # successive edges of a rod have a common node
@@ -104,9 +119,6 @@ class CandidateList:
         self._judge, self._fill = candidate_kernels(kind, real, self.single)
         self._gaps, self._passing = gap_kernel(kind, real), passing_kernel(kind, real)
         self.count = wp.zeros(1, dtype=int, device=self.device)
-        parts = 1 if device_arrays.serial(self.device) else min(max(first.leaves.all // LEAST, 1), PARTS)
-        self._counters = wp.zeros((parts, LINE), dtype=int, device=self.device)
-        self._found = self._counters[:, 0]
         # largest numbers of pairs and of overlapping leaves since the last reallocation
         self._needed = wp.zeros(2, dtype=int, device=self.device)
         self.kernels = [self._meet, self._judge, self._fill, self._gaps, self._passing, *self._sums.kernels]
@@ -157,16 +169,11 @@ class CandidateList:
         """Clear the need of an overflow."""
         self._needed.zero_()
 
-    def meet(self) -> None:
-        """Find leaves with overlapping AABBs; see `kernels.collision.broad_phase.candidates`."""
-        self._counters.zero_()
-        outputs = [self._found, self._met]
-        wp.launch(self._meet, self.first.leaves.all, [self.trees], outputs, device=self.device)
-
-    def narrow_phase(self, x, move, together, search_distance: float, around: float) -> None:
-        """Narrow phase: list overlapping primitives that are in range, or may be during the motion."""
+    def search(self, x, move, together, search_distance: float, around: float) -> None:
+        """List the primitives of overlapping leaves that are in range, or may be during the motion."""
+        self._counts.zero_()
+        self._find_overlaps()
         lists, room = [self._links, self._last], [self.overflow, self._needed]
-        self.partners.zero_()
         inputs = [
             self.sides,
             self.trees,
@@ -179,16 +186,24 @@ class CandidateList:
             self._found,
             self._met,
         ]
-        device_arrays.take_turns(self._judge, len(self._met), inputs, [*lists, self.partners, *room], self.device)
+        outputs = [*lists, self.partners, self._sums.tiles, *room]
+        device_arrays.take_turns(self._judge, len(self._met), inputs, outputs, self.device)
         self._sums()
         inputs = [*lists, self.starts, self.partners]
         wp.launch(self._fill, self.first.all, inputs, [self.pairs, self.count, *room], device=self.device)
 
     def impact(self, kernel, x, move, min_separation_fraction: float, room: float, outputs: list) -> None:
         """Launch a kernel of `kernels.collision.ccd.additive_ccd` on the pairs with overlapping swept AABBs."""
+        self._counters.zero_()
+        self._find_overlaps()
         inputs = [self.sides, self.trees, self._found, self._met, x, move, min_separation_fraction, room]
         outputs = [*outputs, self.overflow, self._needed]
         device_arrays.take_turns(kernel, len(self._met), inputs, outputs, self.device)
+
+    def _find_overlaps(self) -> None:
+        """Find leaves with overlapping AABBs; see `kernels.collision.broad_phase.candidates`."""
+        outputs = [self._found, self._met]
+        wp.launch(self._meet, self.first.leaves.all, [self.trees], outputs, device=self.device)
 
     def measure(self, x, gap, enough: float) -> None:
         """Lower the smallest gaps of worlds to the gaps of pairs, until below `enough`."""

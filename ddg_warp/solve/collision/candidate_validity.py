@@ -52,7 +52,7 @@ class CandidateValidity:
         `start`, `end`: ends of the searched paths (worlds times nodes,).
         `move`: displacements of the present motion (worlds times nodes,).
         `stale`, `beyond`: (1,), nonzero if candidates are outdated, and if outdated for the check of a whole step.
-        `done`: (1,), nonzero if the last `BroadPhase.update` searched.
+        `done`: (1,), nonzero if there was a search since the last `watch`.
     """
 
     def __init__(self, shapes: CollisionMesh, x: wp.array, margin: float):
@@ -68,7 +68,8 @@ class CandidateValidity:
 
     def watch(self, base: wp.array, q: wp.array, stale: wp.array) -> None:
         """Mark candidates as `stale` (1,) for a motion, which becomes the present one; see `BroadPhase`."""
-        self._sweep(self._watch, [base, q, self.start, self.end, self._placed, self._allowed], [self.move, stale])
+        inputs = [base, q, self.start, self.end, self._placed, self._allowed]
+        self._sweep(self._watch, inputs, [self.move, stale, self.done])
 
     def lengthen(self, together: wp.array) -> wp.array:
         """Return the displacements that a search for the present motion covers."""

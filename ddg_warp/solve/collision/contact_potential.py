@@ -102,7 +102,8 @@ class ContactPotential:
         )
         nodes = len(search.shapes.points) * search.worlds
         self.gap = wp.zeros(search.worlds, dtype=self.real, device=self.device)
-        self._no_rate = wp.zeros_like(self.gap)
+        self._no_rate, self._no_gap = wp.zeros_like(self.gap), wp.zeros_like(self.gap)
+        self._least = wp.full_like(self.gap, search.search_distance)  # of the pairs so far
         self.forces = wp.zeros(nodes, dtype=wp.types.vector(3, self.real), device=self.device)
         silenced = np.zeros(len(search.shapes.points), np.uint8)
         silenced[[] if silent is None else silent] = 1
@@ -116,7 +117,7 @@ class ContactPotential:
         self.blocks = ContactBlocks(search, len(self.law.square), self.linear, self.rolls)
         self.products = PairProduct(self._parts, self.law, self.real, self.linear)
         self._rub = PairProduct(self.frictions, self.law, self.real, self.linear) if self.frictions else None
-        self._totals = totals = WorldSums(self.lists, self.frictions, search.worlds, self.real, self.device)
+        self._totals = totals = WorldSums(self.lists, self.frictions, search, self.real)
         self.energy, self.active_pairs, self.dissipated = totals.energy, totals.active_pairs, totals.dissipated
         self._no_iterates = (wp.zeros(0, dtype=int, device=self.device),) * 2
 
@@ -168,7 +169,7 @@ class ContactPotential:
         """
         if not self.frictions:
             return
-        self._start_anew()
+        self._require_fit()
         self.lag_law = self.law
         if self._law_before and rate is not None:
             wp.copy(self._law_before.rate, rate)
@@ -176,7 +177,8 @@ class ContactPotential:
         law = self.lag_law
 
         def lag(part: ContactSet, friction: FrictionSet) -> None:
-            part.write(x, law, self.gap)
+            part.find(x, law, self._no_gap)
+            part.push(x, law)
             friction.lag(law, x, again, self.more)
 
         device_arrays.side_by_side(
@@ -206,7 +208,7 @@ class ContactPotential:
         """
         if rate is not None:
             self._check(rate)
-        self._start_anew()
+        self._require_fit()
         start = self.start if start is None else start
         rate = self._no_rate if rate is None else rate
         iterates = self._no_iterates if iterates is None else iterates
@@ -216,18 +218,19 @@ class ContactPotential:
             for part in self.frictions:
                 part.evaluate(x, start, rate, iterates)
 
-        push = [partial(part.evaluate, x, self.law, self.gap) for part in self.lists]
-        device_arrays.side_by_side([*push, *([evaluate_friction] if self.frictions else [])], self.device)
-        device_arrays.side_by_side([self._sum_up, partial(self._totals, self.search.counters.overflow)], self.device)
+        def evaluate_contact() -> None:
+            device_arrays.side_by_side([partial(part.push, x, self.law) for part in self.lists], self.device)
+            self._totals(self.search.counters.overflow, self._least, self.gap)
 
-    def _sum_up(self) -> None:
+        find = [partial(part.find, x, self.law, self._least) for part in self.lists]
+        device_arrays.side_by_side([*find, *([evaluate_friction] if self.frictions else [])], self.device)
+        device_arrays.side_by_side([evaluate_contact, *(part.list_pairs for part in self.lists)], self.device)
         self.blocks.collect(self.products.sets, self.forces)
 
-    def _start_anew(self) -> None:
-        """Reset the smallest gaps, and refuse lists that have grown since `fit`."""
+    def _require_fit(self) -> None:
+        """Refuse lists that have grown since `fit`."""
         if self._version != self.search.version:
             raise SolverError("the lists of pairs have grown; call fit() of these terms, and capture graphs again")
-        self.gap.fill_(self.search.search_distance)
 
     def product(self, v: wp.array, out: wp.array, x: wp.array | None = None, wanted: wp.array | None = None) -> None:
         """Add H v of the last `evaluate` to `out`, vectors of 3 (worlds times nodes,).

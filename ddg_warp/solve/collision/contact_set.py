@@ -3,8 +3,6 @@
 memory and launches of `kernels.collision.contact.pair_evaluation`, and incidence lists.
 """
 
-from functools import partial
-
 import warp as wp
 
 from ddg_warp import device_arrays
@@ -50,38 +48,33 @@ class ContactSet(CollisionSet):
         serial = device_arrays.serial(self.device)
         self._marks = wp.zeros(0 if serial else self.found.capacity, dtype=int, device=self.device)
         self._running = None if serial else RunningSums(self._marks)
+        self._tiles = self._running.tiles if self._running else self._marks
         if self.mollified:
             self.mollified.reserve()
 
-    def write(self, x: wp.array, law, gap: wp.array) -> None:
-        """Find the active pairs at x, write energies, forces and factors; lower the smallest gaps to the candidates'."""
-        self._find(x, law, gap)
-        self._push(x, law)
-
-    def evaluate(self, x: wp.array, law, gap: wp.array) -> None:
-        """Find and evaluate the active pairs as `write`, and build the incidence lists."""
-        self._find(x, law, gap)
-        list_pairs = partial(self._items.list, self.count, self.factor)
-        device_arrays.side_by_side([partial(self._push, x, law), list_pairs], self.device)
-
-    def _find(self, x: wp.array, law, gap: wp.array) -> None:
+    def find(self, x: wp.array, law, gap: wp.array) -> None:
+        """Find the active pairs at x, and lower the smallest gaps to the candidates'."""
         candidates, data = self.found, [self.found.sides, law, x]
         lists = [self.pairs, self.factor.nodes, self.starts, self.partners, self.count]
         if not self._running:
             self.partners.zero_()
-        self._take_turns(
-            self._sieve, candidates.capacity, [candidates.pairs, candidates.count, *data], [self._marks, gap, *lists]
-        )
+        inputs = [candidates.pairs, candidates.count, *data]
+        self._take_turns(self._sieve, candidates.capacity, inputs, [self._marks, self._tiles, gap, *lists])
         if self._running:
             self._running()
             inputs = [candidates.pairs, candidates.count, candidates.starts, candidates.partners, candidates.sides]
             room = max(candidates.capacity, len(candidates.starts))
-            self._take_turns(self._pack, room, [*inputs, self._marks, self._running.starts], lists)
+            self._take_turns(self._pack, room, [*inputs, self._marks, self._running.starts, self._tiles], lists)
 
-    def _push(self, x: wp.array, law) -> None:
+    def push(self, x: wp.array, law) -> None:
+        """Write energies, forces and factors of the active pairs at x."""
         inputs = [self.pairs, self.count, self.found.sides, law, x]
         outputs = [self.factor, self.energy, self.gradient]
         self._take_turns(self._evaluate, self.found.capacity, inputs, outputs)
+
+    def list_pairs(self) -> None:
+        """Build the incidence lists of the active pairs."""
+        self._items.list(self.count, self.factor)
 
     def exact_product(self, v: wp.array, x: wp.array, law) -> None:
         """Write the product of the exact Hessian at x, the position of `evaluate`, with v to `placed`."""

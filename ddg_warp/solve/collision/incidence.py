@@ -6,7 +6,7 @@ from ddg_warp import device_arrays
 from ddg_warp.kernels.collision.contact.assembly import ANGLES
 from ddg_warp.kernels.collision.contact.incidence import list_kernels
 from ddg_warp.kernels.collision.primitives import Kind
-from ddg_warp.solve.collision.candidate_list import RunningSums
+from ddg_warp.solve.collision.candidate_list import RunningSums, tiles_of
 
 
 class Incidence:
@@ -24,9 +24,10 @@ class Incidence:
     def __init__(self, kind: Kind, nodes: int, silent: wp.array, rolls: bool = False):
         self.device, self._size, self._silent = silent.device, kind.first + kind.second, silent
         self._angles = ANGLES if rolls else 0
-        self._both = wp.zeros((2, nodes), dtype=int, device=self.device)  # zeroed at once
-        self.numbers, self._filled = self._both[0], self._both[1]
-        self._running = RunningSums(self.numbers)
+        tiles = tiles_of(nodes)
+        self._counts = wp.zeros(2 * nodes + tiles, dtype=int, device=self.device)  # zeroed at once
+        self.numbers, self._filled = self._counts[:nodes], self._counts[nodes : 2 * nodes]
+        self._running = RunningSums(self.numbers, self._counts[2 * nodes :])
         self.places = self._running.starts
         self._number, self._fill, self._sort = list_kernels(kind, device_arrays.serial(self.device), rolls)
         self.kernels = [self._number, self._fill, self._sort, *self._running.kernels]
@@ -41,9 +42,9 @@ class Incidence:
     def list(self, count: wp.array, factor) -> None:
         """Build the lists of `count` pairs, with the nodes and twist angles of their factors."""
         nodes = factor.nodes
-        self._both.zero_()
+        self._counts.zero_()
         inputs = [count, nodes, factor.angles, self._silent]
-        self._take_turns(self._number, len(nodes), inputs, [self.numbers])
+        self._take_turns(self._number, len(nodes), inputs, [self.numbers, self._running.tiles])
         self._running()
         ranks = [self.ranks, self.angle_ranks]
         self._take_turns(self._fill, len(nodes), [*inputs, self.places], [self._filled, self._unordered, *ranks])

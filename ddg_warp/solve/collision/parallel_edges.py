@@ -49,10 +49,11 @@ class NearParallelEdges:
         """Find near-parallel pairs at positions x and differentiate, in `wanted` worlds."""
         elements = self._of
         inputs = [elements.pairs, elements.count, elements.found.first.count, wanted, elements.factor]
-        self._sweep(self._mark, len(self.marks), inputs, [self.marks])
+        tiles = self._running.tiles
+        self._sweep(self._mark, len(self.marks), inputs, [self.marks, tiles])
         self._running()
         chosen = [self._chosen, self._number]
-        self._sweep(choose, len(self.marks), [elements.count, self.marks, self.starts], chosen)
+        self._sweep(choose, len(self.marks), [elements.count, self.marks, self.starts], [*chosen, tiles])
         threads = device_arrays.takers(min(3 * PAIR_NODES * len(self._chosen), MOST), elements.device)
         inputs = [elements.pairs, elements.found.sides, law, x, elements.factor, *chosen, threads]
         wp.launch(self._differentiate, threads, inputs, [self.columns], device=elements.device)

@@ -32,7 +32,8 @@ class StepFilter:
         self._earliest, self._later = (wp.zeros(worlds, dtype=real, device=device) for _ in range(2))
         self._open, self.limited = (wp.zeros(worlds, dtype=int, device=device) for _ in range(2))
         self._changed, self._rounds = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
-        self._numbers = [wp.zeros(1, dtype=int, device=device) for _ in lists]
+        self._numbers = wp.zeros(len(lists), dtype=int, device=device)
+        self._each_number = [self._numbers[k : k + 1] for k in range(len(lists))]
         self._unpicked = wp.zeros(0, dtype=int, device=device)
         self.shares = self._all[0]
 
@@ -76,16 +77,13 @@ class StepFilter:
         move = validity.move
         shares, before, lowered = (array[: self._worlds * num_ccd_bodies] for array in self._all)
         self.shares = shares
-        self._sweep(self._start, len(shares), [], [shares, before, lowered])
-        for times in (self._earliest, self._later, time):
-            times.fill_(1.0)
-        for numbers in (self._rounds, self.limited):
-            numbers.zero_()
+        outputs = [shares, before, lowered, self._earliest, self._later, time, self.limited]
+        rounds = [self._open, self._changed, self._rounds]
+        self._sweep(self._start, len(shares), [], [*outputs, *rounds])
 
         def lower(times: wp.array, again: bool, pick, limit, pairs, number: wp.array) -> None:
             count, picked = pairs.count, self._unpicked
             if again:
-                number.zero_()
                 inputs = [pairs.pairs, count, pairs.sides, ccd_body, num_ccd_bodies, shares, before]
                 device_arrays.take_turns(pick, pairs.capacity, inputs, [pairs.picked, number], self._device)
                 count, picked = number, pairs.picked
@@ -105,8 +103,9 @@ class StepFilter:
             device_arrays.take_turns(limit, pairs.capacity, inputs, [lowered, times], self._device)
 
         def go(times: wp.array, again: bool = True) -> None:
-            wp.launch(self._turn, self._worlds, [], [self._open, self._changed, self._rounds], device=self._device)
-            of_lists = zip(self._picks, self._limits, self._lists, self._numbers, strict=True)
+            if again:
+                wp.launch(self._turn, self._worlds, [], [*rounds, self._numbers], device=self._device)
+            of_lists = zip(self._picks, self._limits, self._lists, self._each_number, strict=True)
             device_arrays.side_by_side(
                 [partial(lower, times, again, *list_data) for list_data in of_lists], self._device
             )

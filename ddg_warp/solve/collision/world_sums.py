@@ -16,9 +16,11 @@ class WorldSums:
         `dissipated`: (worlds,) [J] friction work from the start to the last evaluation, the sum of forces times slip.
     """
 
-    def __init__(self, contacts: list, frictions: list, worlds: int, real, device):
-        self._contacts, self._frictions, self._device = contacts, frictions, device
-        self._real, self._worlds = real, worlds
+    def __init__(self, contacts: list, frictions: list, search, real):
+        worlds, self._device = search.worlds, search.device
+        self._contacts, self._frictions = contacts, frictions
+        self._real, self._worlds, self._search_distance = real, worlds, search.search_distance
+        device = self._device
         self.energy, self.dissipated = (wp.zeros(worlds, dtype=real, device=device) for _ in range(2))
         self.active_pairs = wp.zeros(worlds, dtype=int, device=device)
         primitives = max(contact.found.first.count for contact in contacts)
@@ -35,15 +37,16 @@ class WorldSums:
         self._lists = [self._written(pair_set) for pair_set in (*self._contacts, *self._frictions)]
         self._written_by = wp.array(self._lists, dtype=written_struct(self._real), device=self._device)
 
-    def __call__(self, overflow: wp.array) -> None:
-        """Sum the last evaluation over each world."""
+    def __call__(self, overflow: wp.array, least: wp.array, gap: wp.array) -> None:
+        """Sum the last evaluation over each world; write the smallest gaps to `gap`, and reset `least`."""
         inputs = [self._written_by, self._worlds]
         device_arrays.sweep(
             self._add, self._of_primitives.shape[1], inputs, [self._of_primitives], self._device, worlds=self._worlds
         )
         self._sum(self._of_primitives, self._of_worlds.flatten())
-        outputs = [self.energy, self.active_pairs, self.dissipated]
-        wp.launch(self._tell, self._worlds, [self._of_worlds, overflow], outputs, device=self._device)
+        inputs, outputs = [self._of_worlds, overflow, self._search_distance], [self.energy, self.active_pairs]
+        outputs += [self.dissipated, least, gap]
+        wp.launch(self._tell, self._worlds, inputs, outputs, device=self._device)
 
     def _written(self, pair_set):
         struct = written_struct(self._real)()

@@ -114,7 +114,7 @@ class NewtonContact:
     def place(self, iterates, system, islands) -> None:
         """Limit the predictor by CCD, once supports are at their prescribed positions."""
         self.pending.aim(iterates)
-        self.limit.begin(islands, predictor=True)
+        self.limit.begin(islands, self.pending, predictor=True)
         self._limit(iterates, system, islands)
         self.limit.mark_limited(islands)
         self.pending.end(iterates, islands)
@@ -144,7 +144,7 @@ class NewtonContact:
     def hold(self, iterates, search, system, islands) -> None:
         """Limit the trial step by CCD, and write its predicted decrease."""
         modes, blocks = self.limit.modes, self.coupled.blocks
-        self.limit.begin(islands)
+        self.limit.begin(islands, self.pending)
         self.pending.land(iterates, system, islands, modes)
         self._limit(iterates, system, islands)
         self.pending.end(iterates, islands)

@@ -14,6 +14,9 @@ class PendingMotion:
 
     Args:
         linear: scalar type of directions.
+
+    Attributes:
+        going: (1,), nonzero if a world has pending motion; `StepLimit.begin` resets it, `end` sets it.
     """
 
     def __init__(self, model, linear):
@@ -24,16 +27,16 @@ class PendingMotion:
         self._aims = wp.zeros((max(1, len(support_blocks)), worlds), dtype=self.coupled.vector, device=device)
         blocks, vector = worlds * self.coupled.blocks, wp.types.vector(3, linear)
         self._rest, self._product = (wp.zeros(blocks, dtype=vector, device=device) for _ in range(2))
-        self._any = wp.zeros(1, dtype=int, device=device)
+        self.going = wp.zeros(1, dtype=int, device=device)
         self.kernels = pending_kernels(self.coupled.real, linear, device_arrays.serial(device))
-        self._aim, self._depart, self._land, self._arrive, self._end = self.kernels[:5]
-        self._find_rest, self._push, self._lessen, self._add = self.kernels[5:]
+        self._aim, self._land, self._arrive, self._end = self.kernels[:4]
+        self._find_rest, self._push, self._lessen, self._add = self.kernels[4:]
 
     def clear(self, iterates, islands) -> None:
         """End all pending motion: the target is the iterate itself."""
         wp.copy(iterates.proposed, iterates.q)
         islands.support_motion_pending.zero_()
-        self._any.zero_()
+        self.going.zero_()
 
     def aim(self, iterates) -> None:
         """Store the prescribed positions of supports, where a predictor has them."""
@@ -41,7 +44,6 @@ class PendingMotion:
 
     def land(self, iterates, system, islands, modes: wp.array) -> None:
         """Complete the motion of supports after full updates, in worlds with `modes` of an update."""
-        wp.launch(self._depart, self.coupled.worlds, [modes], [islands.arrays[0]], device=self.coupled.device)
         inputs = [self._aims, system.masks.fixed, modes, *islands.arrays, self.coupled.blocks]
         self._launch(self._land, inputs, [iterates.q])
 
@@ -52,10 +54,8 @@ class PendingMotion:
 
     def end(self, iterates, islands) -> None:
         """Reset the target to the iterate in worlds without pending motion."""
-        self._any.zero_()
-        self.coupled.sweep(
-            self._end, [iterates.q, islands.arrays[0], self.coupled.blocks], [iterates.proposed, self._any]
-        )
+        inputs = [iterates.q, islands.arrays[0], self.coupled.blocks]
+        self.coupled.sweep(self._end, inputs, [iterates.proposed, self.going])
 
     def approach(self, iterates, system, terms) -> None:
         """Subtract the resistance of a `ContactPotential` against pending motion from the residual."""
@@ -68,12 +68,12 @@ class PendingMotion:
             terms.product(self._rest, self._product)
             self.coupled.sweep(self._lessen, [self._product, fixed, wanted, blocks], [system.rhs])
 
-        wp.capture_if(self._any, approach)
+        wp.capture_if(self.going, approach)
 
     def follow(self, system) -> None:
         """Add pending motion to the directions."""
         inputs, outputs = [self._rest, system.wanted, self.coupled.blocks], [system.direction]
-        wp.capture_if(self._any, lambda: self.coupled.sweep(self._add, inputs, outputs))
+        wp.capture_if(self.going, lambda: self.coupled.sweep(self._add, inputs, outputs))
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         """Launch over the supports of every world, if any."""

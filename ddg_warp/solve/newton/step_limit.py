@@ -38,10 +38,10 @@ class StepLimit:
         self.kernels = limit_kernels(real, device_arrays.serial(device))
         self._find_modes, self._find_predicted, self._stay, self._near, self._less, self._find_short = self.kernels
 
-    def begin(self, islands, predictor: bool = False) -> None:
-        """Find the worlds with a proposed motion: of an update, or the predictor of a step."""
+    def begin(self, islands, pending, predictor: bool = False) -> None:
+        """Find the worlds with a proposed motion: of an update, or the predictor of a step; reset `PendingMotion.going`."""
         kernel = self._find_predicted if predictor else self._find_modes
-        self._launch(kernel, [islands.arrays[0]], [self.modes, self._longest])
+        self._launch(kernel, [islands.arrays[0]], [self.modes, self._longest, pending.going])
 
     def __call__(self, iterates) -> None:
         """Limit the proposed motion from `base` to `q`; `proposed` keeps the proposed end."""

@@ -86,12 +86,15 @@ def motion_kernels(real, serial: bool):
         allowed: real,
         move: wp.array(dtype=X),
         stale: wp.array(dtype=int),
+        done: wp.array(dtype=int),
     ):
-        """Write displacements, and set `stale` if a node has left the margin of its searched path.
+        """Write displacements, clear `done`, and set `stale` if a node has left the margin of its searched path.
 
         A node that is not finite has left it. Only nodes in `placed` have positions.
         """
         tid = wp.tid()
+        if tid == 0:
+            done[0] = 0
         for i in range(tid, until(tid, q.shape[0])):
             if placed[i % placed.shape[0]] != wp.uint8(0):
                 start_offset, _b = path_offset(start[i], end[i], base[i], base[i])

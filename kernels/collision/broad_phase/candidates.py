@@ -50,6 +50,7 @@ from ddg_warp.kernels.collision.broad_phase.aabb import BvhPair, overlap
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import corners_function, relative_function
 from ddg_warp.kernels.collision.primitives import Kind, pair_functions, sides_struct
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
+from ddg_warp.kernels.core.prefix_sum import add_to_tile
 from ddg_warp.kernels.core.vectorised_access import read_function
 
 MOST = 2**31 - 1  # largest number of pairs that can be counted
@@ -243,6 +244,7 @@ def candidate_kernels(kind: Kind, real, single: bool):
         links: wp.array(dtype=wp.vec2i),
         last_link: wp.array(dtype=int),
         partners: wp.array(dtype=int),
+        tiles: wp.array(dtype=int),
         overflow: wp.array(dtype=int),
         needed: wp.array(dtype=int),
     ):
@@ -268,6 +270,7 @@ def candidate_kernels(kind: Kind, real, single: bool):
                                 l + w * sides.counts[1], wp.atomic_exch(last_link, i, link_index)
                             )
                             wp.atomic_add(partners, i, 1)
+                            add_to_tile(tiles, i, 1)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def fill(

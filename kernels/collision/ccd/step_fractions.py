@@ -115,8 +115,8 @@ def limit_kernels(kind: Kind, real):
 def fraction_kernels(real, serial: bool):
     """Build the kernels of step fractions.
 
-    `start`: initialise fractions with 1.
-    `turn`: begin a round.
+    `start`: initialise fractions with 1, and begin the first round.
+    `turn`: begin a further round.
     `settle`: take over the fractions of a round, and find changes.
     `finish`: replace fractions that still change by safe ones.
     `shorten`: limit the motion.
@@ -124,21 +124,49 @@ def fraction_kernels(real, serial: bool):
     X, until = wp.types.vector(3, real), until_function(serial)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def start(shares: wp.array(dtype=real), before: wp.array(dtype=real), lowered: wp.array(dtype=real)):
-        """Set fractions to the whole motion, with no previous value."""
+    def start(
+        shares: wp.array(dtype=real),
+        before: wp.array(dtype=real),
+        lowered: wp.array(dtype=real),
+        earliest: wp.array(dtype=real),
+        later: wp.array(dtype=real),
+        time: wp.array(dtype=real),
+        limited: wp.array(dtype=int),
+        open: wp.array(dtype=int),
+        changed: wp.array(dtype=int),
+        rounds: wp.array(dtype=int),
+    ):
+        """Set fractions and times to the whole motion, without a previous fraction, and count the first round."""
         tid = wp.tid()
         for i in range(tid, until(tid, shares.shape[0])):
             shares[i] = real(1.0)
             before[i] = real(-1.0)
             lowered[i] = real(1.0)
+            if i < time.shape[0]:
+                earliest[i] = real(1.0)
+                later[i] = real(1.0)
+                time[i] = real(1.0)
+                limited[i] = 0
+                open[i] = 0
+            if i == 0:
+                changed[0] = 0
+                rounds[0] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def turn(open: wp.array(dtype=int), changed: wp.array(dtype=int), rounds: wp.array(dtype=int)):
+    def turn(
+        open: wp.array(dtype=int),
+        changed: wp.array(dtype=int),
+        rounds: wp.array(dtype=int),
+        numbers: wp.array(dtype=int),
+    ):
+        """Count a round, and clear the numbers of picked pairs."""
         w = wp.tid()
         open[w] = 0
         if w == 0:
             changed[0] = 0
             rounds[0] += 1
+            for k in range(numbers.shape[0]):
+                numbers[k] = 0
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def settle(

@@ -11,6 +11,7 @@ import warp as wp
 from ddg_warp.kernels.collision.contact.assembly import ITEMS, PAIR_NODES
 from ddg_warp.kernels.collision.primitives import Kind
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
+from ddg_warp.kernels.core.prefix_sum import add_to_tile
 
 
 @cache
@@ -66,12 +67,14 @@ def list_kernels(kind: Kind, serial: bool, rolls: bool = False):
         angles: wp.array(dtype=wp.vec2i),
         silent: wp.array(dtype=wp.uint8),
         numbers: wp.array(dtype=int),
+        tiles: wp.array(dtype=int),
     ):
         for p in range(wp.tid(), count[0], threads):
             for local in range(wp.static(locals_per_pair)):
                 node = node_of(nodes, angles, silent, p, local)
                 if node >= 0:
                     wp.atomic_add(numbers, node, 1)
+                    add_to_tile(tiles, node, 1)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def fill(

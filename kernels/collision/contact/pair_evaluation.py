@@ -15,6 +15,7 @@ from ddg_warp.kernels.collision.contact.closest_points import MOLLIFIER_FRACTION
 from ddg_warp.kernels.collision.contact.potential import bend_function, pair_energy_functions, rows_of
 from ddg_warp.kernels.collision.primitives import EDGES, Kind, pair_functions, primitives_function, sides_struct
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, TWO_BLOCKS
+from ddg_warp.kernels.core.prefix_sum import add_to_tile, clear_tiles
 from ddg_warp.kernels.densities import Density
 
 
@@ -140,6 +141,7 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
         law: Law,
         x: wp.array(dtype=V),
         marks: wp.array(dtype=int),
+        tiles: wp.array(dtype=int),
         gap: wp.array(dtype=real),
         pairs_out: wp.array(dtype=wp.vec2i),
         nodes_out: wp.array(dtype=wp.vec4i),
@@ -169,6 +171,8 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
                     packed += 1
             else:
                 marks[k] = wp.where(pushes, 1, 0)
+                if pushes:
+                    add_to_tile(tiles, k, 1)
         if wp.static(serial):
             count_out[0] = packed
 
@@ -182,13 +186,15 @@ def evaluate_kernels(kind: Kind, density: Density, real, linear, serial: bool):
         sides: Sides,
         marks: wp.array(dtype=int),
         before: wp.array(dtype=int),
+        tiles: wp.array(dtype=int),
         pairs_out: wp.array(dtype=wp.vec2i),
         nodes_out: wp.array(dtype=wp.vec4i),
         starts_out: wp.array(dtype=int),
         partners_out: wp.array(dtype=int),
         count_out: wp.array(dtype=int),
     ):
-        """Compact marked candidates, with `before` the number of marked ones before each."""
+        """Compact marked candidates, with `before` the number of marked ones before each; clear the sums of tiles."""
+        clear_tiles(tiles, wp.tid(), threads)
         most = count[0]
         for k in range(wp.tid(), most, threads):
             if marks[k] != 0:
@@ -335,9 +341,12 @@ def mark_kernel(linear):
         wanted: wp.array(dtype=int),
         factor: Factor,
         marks: wp.array(dtype=int),
+        tiles: wp.array(dtype=int),
     ):
         for p in range(wp.tid(), count[0], threads):
             asked = factor.used[p] != 0 and factor.bend[p] == linear(0.0) and wanted[pairs[p][0] / first_count] != 0
             marks[p] = wp.where(asked, 1, 0)
+            if asked:
+                add_to_tile(tiles, p, 1)
 
     return mark

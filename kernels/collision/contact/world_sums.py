@@ -64,14 +64,22 @@ def total_kernels(real, serial: bool):
     def tell(
         sums: wp.array2d(dtype=real),
         overflow: wp.array(dtype=int),
+        search_distance: real,
         energy: wp.array(dtype=real),
         active_pairs: wp.array(dtype=int),
         dissipated: wp.array(dtype=real),
+        least: wp.array(dtype=real),
+        gap: wp.array(dtype=real),
     ):
-        """Write the results of each world; energies are infinite if pairs overflowed."""
+        """Write the results of each world; energies are infinite if pairs overflowed.
+
+        The smallest gap [m] of all pairs, `least`, is reset to `search_distance` for the next evaluation.
+        """
         w = wp.tid()
         energy[w] = wp.where(overflow[0] == 0, sums[wp.static(ENERGY), w], real(wp.inf))
         active_pairs[w] = int(sums[wp.static(ACTIVE_PAIRS), w])
         dissipated[w] = sums[wp.static(WORK), w]
+        gap[w] = least[w]
+        least[w] = search_distance
 
     return add, tell
