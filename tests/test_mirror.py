@@ -34,7 +34,6 @@ TESTED_BY = {
     "kernels/core/division": ("kernels/test_shell_measures.py", "degenerate"),
     "kernels/core/dof_map": ("test_gyroscopic.py", "Integrator"),
     "kernels/core/nodes": ("test_warm_start.py", "Integrator"),
-    "kernels/core/prefix_sum": ("collision/test_broad_phase.py", "candidate_pairs"),
     "kernels/densities": ("kernels/test_terms.py", "REGISTRY"),
     "kernels/elements": ("kernels/test_terms.py", "REGISTRY"),
     "kernels/forces": ("test_controls.py", "Controls"),
