@@ -16,7 +16,7 @@ from ddg_warp.solve.equilibrium.rod_tangent import RodTangent
 from ddg_warp.solve.linear.cyclic_reduction import CyclicReduction, Elimination
 from ddg_warp.solve.linear.solver_selection import automatic
 from ddg_warp.solve.linear.sparse_direct import SingularError, regular
-from ddg_warp.solve.newton.rod_newton import NewtonOptions, RodNewton
+from ddg_warp.solve.newton.rod_newton import NewtonOptions
 from ddg_warp.solve.newton.rod_newton_assembled import AssembledNewton
 
 CLOSE = 1e-5  # accepted relative error of w from refined float32 solutions; roll-outs amplify it ...
@@ -164,8 +164,10 @@ def _transposed(matrix: sparse.csc_matrix):
 class DirectSolve:
     """Device solver of H w = g of a rod group.
 
-    Factors come from the sweep or, of closed rods or in another precision than the state's, from block elimination or cyclic
-    reduction, in another precision with iterative refinement.
+    The system is assembled in blocks and factorised by block elimination or cyclic reduction; in another precision than the state's
+    with iterative refinement.
+
+    Measured: the sweep of Newton's method with second derivatives keeps more in float64 than a GPU has registers.
 
     Args:
         linear: precision of the factors; by default that of the state.
@@ -180,15 +182,9 @@ class DirectSolve:
         kind, device, real = group.kind, model.wp_device, model.types.real
         arguments, size = (model, group, NewtonOptions(psd="none"), real), (group.nodes, group.columns)
         self._wanted = wp.full(group.columns, 1, dtype=int, device=device)
-        few = automatic(group) == "cyclic_reduction"
-        if not few and not kind.closed and linear is None:
-            self.solver, self.system = None, RodNewton(*arguments)
-            self._moved = self.system.iterates  # with arrays that the sweep moves along w
-            self.failed = self.system.islands.status
-            return
         self.system = AssembledNewton(*arguments, stored=linear)
         precision_of_factors = linear or real
-        if few:
+        if automatic(group) == "cyclic_reduction":
             self.solver = CyclicReduction(kind.block, *size, precision_of_factors, device, repeated=linear is not None)
         else:
             self.solver = Elimination(kind, *size, precision_of_factors, device)
@@ -202,11 +198,8 @@ class DirectSolve:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        around = [(self.system._evaluate, 128)]
-        if self.solver is None:
-            return [*around, *self.system.sweeps]
         refined = [self._product, self._guess, self._rest, self._add] if self.passes else []
-        return [*around, self.system._assemble, *self.solver.kernels, *refined]
+        return [(self.system._evaluate, 128), self.system._assemble, *self.solver.kernels, *refined]
 
     def __call__(self, solved, last: wp.array, rate: float, coefficient: float, rhs: wp.array, w: wp.array, resisted):
         """Write w; launches only. Arguments as of `RodLinearSolve`, `coefficient` that of inertia [1/s^2]."""
@@ -221,14 +214,6 @@ class DirectSolve:
             adjoint, *states = resisted
             adjoint.drag.resist(*states, loading.mass, loading.rotary, system.iterates.target_angle, islands)
         system.evaluate(last)
-        if self.solver is None:
-            islands.frames_outdated.zero_()  # keep the frames of the step
-            system.iterates, system.direction = self._moved, w
-            device_arrays.copy(system.rhs, rhs)  # the sweep overwrites it
-            device_arrays.copy(system.iterates.x, solved.x)
-            device_arrays.copy(system.iterates.theta, solved.theta)
-            system.eliminate()
-            return
         system.assemble_blocks()
         if not self.passes:
             self._solve(rhs, w)
