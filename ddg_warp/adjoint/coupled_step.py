@@ -264,8 +264,8 @@ class CoupledStepAdjoint:
         self._rates.fill_(rate)
         end, out, began, more = *map(coupled.node_state, (cotangent, start, before)), components(by_end)
         masses = [coupled.mass.transpose((1, 0)), None]
-        read = [end, more, None, *masses, self._resisted, coupled.count, last, self._rates]
-        self._launch(self._solution, grid, read, [components(grad_q), None])
+        read = [end, more, *masses, self._resisted, coupled.count, last, self._rates]
+        self._launch(self._solution, grid, read, [components(grad_q)])
         self._friction_rate.fill_(kept.friction_rate or rate)
         rough, lag_pairs = None, reversed(list(pairwise([before.q, *kept.lagged, solved.q])))
         if kept.friction_rate:  # normal forces of the equilibrium

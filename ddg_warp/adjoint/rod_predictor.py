@@ -43,7 +43,7 @@ class RodPredictor:
         self._dt = wp.zeros(model.worlds, dtype=real, device=device)
         self._none = wp.zeros(group.columns, dtype=real, device=device)
         self._begin = time_step.begin_kernel(kind.nodes, real, midpoint)
-        self._carry = rod_elements.frame_kernel(kind, real, unit=False) if self.carries else None
+        self._carry = rod_elements.transport_kernel(kind, real) if self.carries else None
         self._vjp = rod_predictor.predict_kernel(kind, real, midpoint)
 
     @classmethod

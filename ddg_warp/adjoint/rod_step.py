@@ -12,8 +12,8 @@ from ddg_warp.adjoint.linear_solve import RodLinearSolve
 from ddg_warp.adjoint.rod_predictor import RodPredictor
 from ddg_warp.adjoint.supports import Supports
 from ddg_warp.compile.dof_map import FREE
-from ddg_warp.kernels.adjoint import elements, rod_elements
-from ddg_warp.kernels.adjoint import time_step as step
+from ddg_warp.kernels.adjoint import elements, rod_elements, time_step
+from ddg_warp.kernels.adjoint.rod_step import rod_step_kernels
 from ddg_warp.kernels.elements.rod_layout import rod_storage
 from ddg_warp.model.state import RodGroupState
 
@@ -96,7 +96,7 @@ class RodStepAdjoint:
         posed: True if equilibria take poses of grips.
 
     Attributes:
-        unread: names of the arrays of the end state that the reverse does not read.
+        unread: names of the arrays that the reverse does not read, of the start, of the end, and of the gradient by the end.
 
     Raises:
         SceneError: a motion has no gradient; see `Supports`.
@@ -118,10 +118,15 @@ class RodStepAdjoint:
         storage, viscous = rod_storage(kind, real), kind.viscous
         self._vjp = [elements.pull_kernel(storage, i, real, False, viscous) for i in terms]
         self._strain = [elements.strain_vjp_kernel(storage, i, real, False) for i in terms] if viscous else []
-        self._frame = rod_elements.frame_kernel(kind, real, first=not kind.viscous) if kind.twist else None
-        self._ends, self._nodes, self._edges = rod_elements.gather_kernels(kind, real)
-        self.unread = {"v", "omega", "a", "alpha"} | (set() if kind.viscous else {"frame", "last"})
-        self._solution, self._inertia, self._start = step.step_kernels(kind.nodes, real, midpoint, kind.drag)
+        self._nodes, self._edges = rod_elements.gather_kernels(kind, real)
+        accelerations = {"a", "alpha"}
+        of_end = accelerations | {"v", "omega"} | (set() if kind.viscous else {"frame", "last"})
+        self.unread = accelerations, of_end, accelerations
+        # parts whose contributions come between those of elements and of the end update
+        parts = (self.supports, self.drag, self.followers, self.predictor)
+        self._complete = scheme is not None and not any(parts)
+        self._end, self._start = rod_step_kernels(kind, real, midpoint, self._complete)
+        *_, self._update = time_step.step_kernels(kind.nodes, real, midpoint, kind.drag)
         leaves = np.tile(~group.host.fixed | _moved(group), (1, group.worlds))
         self._leaves = device_arrays.upload(leaves, wp.uint8, device)
         self._rate = wp.zeros(group.columns, dtype=real, device=device)
@@ -220,29 +225,27 @@ class RodStepAdjoint:
                 by_frame = cotangents.frame
                 device_arrays.copy(by_frame, cotangent.frame)
                 self._launch(self._edges, [lag, group.count], [by_frame])
-        if kind.twist:
-            self._launch(self._frame, [after.x, kept.frame, group.count, by_frame], [window, lagged])
-        if kind.twist or kind.viscous:
-            self._launch(self._ends, [window, group.count], [cotangents.end])
         end, out, began = map(group.node_state, (cotangent, start, before))
-        masses = [group.mass, group.rotary]
-        read = [end, cotangents.end, group.fixed, *masses, None, group.count, group.nodes, self._rate]
-        self._launch(self._solution, read, [by_solution, cotangents.rhs])
+        masses = [group.mass, group.rotary, None]
+        read = [end, after.x, kept.frame, by_frame, window, group.fixed, *masses, group.count, self._rate]
+        self._launch(self._end, read, [lagged, cotangents.end, by_solution, cotangents.rhs])
         resisted = self.drag and (self.drag, before, tangents)
         self.solve(kept, before.last, s, cotangents.rhs, inputs.load, resisted)
-        read = [kept.x, kept.theta, began, inputs.load, *masses, group.count, group.nodes, group.nodes]
-        read += [self._rate, self._damping, self.gravity, group.world]
-        written = [out, inputs.mass, inputs.rotary, inputs.rate, inputs.damping, inputs.gravity, None]
-        self._launch(self._inertia, read, written)
+        if kind.viscous:
+            device_arrays.clear(inputs.rate)
         read = [group.element_inputs(kept, before.last, self._rate), inputs.load]
         written = [*map(device_arrays.columns, (window, lag, inputs.parameters, start.last, inputs.rate))]
         for kernel in self._vjp:
             self._launch(kernel, read, written)
-        self._launch(self._nodes, [window, group.count], [by_solution])
+        solution = [end, cotangents.end, kept.x, kept.theta, began]
+        read = [*solution, inputs.load, window, lag, self._leaves, *masses, group.count]
+        read += [self._rate, self._damping, self.gravity, group.world]
+        written = [by_solution, lagged, out, inputs.mass, inputs.rotary, inputs.rate, inputs.damping, inputs.gravity]
+        self._launch(self._start, read, written)
+        if self._complete:
+            return start, inputs
         if self.solve.held is not None:
             device_arrays.assign(by_solution, device_arrays.download(by_solution) + self.solve.held)
-        if kind.twist:
-            self._launch(self._edges, [lag, group.count], [lagged])
         if self.supports and kind.twist:
             force = by_solution[: kind.dim], by_solution[kind.dim]
             self.supports.follow(*states)
@@ -256,16 +259,16 @@ class RodStepAdjoint:
             self.followers.vjp(predictor.x, *w, predictor.by_x[: kind.dim])
         if predictor:
             predictor.vjp(before, self._nodes, window, by_solution, start, inputs.rate)
-        read = [end, cotangents.end, kept.x, kept.theta, began, by_solution, self._leaves, *masses, None, group.count]
-        self._launch(self._start, [*read, group.nodes, self._rate], [out, inputs.rate])
+        read = [*solution, by_solution, self._leaves, *masses, group.count, group.nodes, self._rate]
+        self._launch(self._update, read, [out, inputs.rate])
         return start, inputs
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        result = [*self._vjp, *self._strain, self._ends, self._nodes, self._edges]
-        result += [self._solution, self._inertia, self._start]
-        result += [*([self._frame] if self._frame else []), *self.solve.kernels]
+        result = [*self._vjp, *self._strain, self._end, self._start, *self.solve.kernels]
+        result += [] if self._complete else [self._nodes, self._update]
+        result += [self._edges] if self._strain else []
         parts = (self.supports, self.drag, self.followers, self.predictor)
         return result + [kernel for part in parts if part for kernel in part.kernels]
 

@@ -202,9 +202,10 @@ class Engine:
         adjoint = self._adjoint()
         self.controls.give_field(controls)
         self.controls.give_gravity(controls, adjoint)
-        self.fill(self.source, before)
-        self.fill([self.target[i] for i in self._read], [after[i] for i in self._read])
-        self.fill(self._by_state, cotangent)
+        for targets, values, read in zip(
+            (self.source, self.target, self._by_state), (before, after, cotangent), self._read, strict=True
+        ):
+            self.fill([targets[i] for i in read], [values[i] for i in read])
         self.fill(self._output_places, other_results)
         if adjoint.upload(start, dt, self.tables.given):
             self._graphs.clear()
@@ -273,10 +274,8 @@ class Engine:
             adjoint = Adjoint(self.integrator)
             self._given = self.model.empty_state()
             self._by_state = tensors(self._given, self.fields)
-            unread = {
-                f"{i}/{name}" for i, rod_adjoint in enumerate(adjoint.rod_adjoints) for name in rod_adjoint.unread
-            }
-            self._read = [i for i, field in enumerate(self.fields) if field.name not in unread]
+            # fields of the start, of the end, and of the gradient by the end
+            self._read = [self._indices_but([part.unread[k] for part in adjoint.rod_adjoints]) for k in range(3)]
             self._graphs = Graphs(self.model, self._load)
             # same layout as states, so that a graph can copy it
             solved = (self.model.empty_state() if self.midpoint else self.after).groups
@@ -297,6 +296,11 @@ class Engine:
             self._make_flags()
             self.poses = Poses(adjoint, self.midpoint) if self.model.grips else None
         return self.adjoint
+
+    def _indices_but(self, unread: list[set[str]]) -> list[int]:
+        """Return the indices of all fields but those that each rod group does not read."""
+        names = {f"{i}/{name}" for i, each in enumerate(unread) for name in each}
+        return [i for i, field in enumerate(self.fields) if field.name not in names]
 
     def _make_flags(self) -> None:
         """Allocate the flags that a backward pass reads and writes."""

@@ -32,23 +32,43 @@ def put_function(kind: RodKind, real, first: bool):
 
 
 @cache
-def frame_kernel(kind: RodKind, real, unit: bool = True, first: bool = True):
-    """Build the kernel of gradients by frames.
+def frame_function(kind: RodKind, real, unit: bool):
+    """Return the device function `frame_vjp(x, frame, cotangent, k, n, r) -> (edge, director, tangent)`.
 
-    `vjp`: reverse `kernels.stepping.rod_step.finish_frames_kernel`, or without `unit` the frame update `relag` of
-    `kernels.newton.rod_iterate`. Frames are written; the first edges of element windows are written if `first`, else added to.
+    It reverses `kernels.stepping.rod_step.finish_frames_kernel` at edge k, or without `unit` the frame update `relag` of
+    `kernels.newton.rod_iterate`: gradients by the edge and by its lagged frame.
 
     The reference twist is recomputed at every state; the lagged one only selects its multiple of 2 pi.
     """
     V, X = wp.types.vector(kind.dim, real), wp.types.vector(3, real)
     along_node, *_ = gather_functions(kind, real)
     carried = transported_function(real, unit)
-    closed = kind.closed
-    W, put = wp.types.vector(kind.window, real), put_function(kind, real, first)
 
     @wp.func
     def three(a: wp.array3d(dtype=real), row: int, k: int, r: int):
         return X(a[row, k, r], a[row + 1, k, r], a[row + 2, k, r])
+
+    @wp.func
+    def frame_vjp(
+        x: wp.array2d(dtype=V), frame: wp.array3d(dtype=real), cotangent: wp.array3d(dtype=real), k: int, n: int, r: int
+    ):
+        e = x[along_node(k + 1, n), r] - x[k, r]
+        de, du, dt, _u, _t = wp.grad(carried)(
+            e, three(frame, 0, k, r), three(frame, 3, k, r), three(cotangent, 0, k, r), three(cotangent, 3, k, r)
+        )
+        return de, du, dt
+
+    return frame_vjp
+
+
+@cache
+def transport_kernel(kind: RodKind, real):
+    """Build the kernel of gradients by frames that a midpoint solve has transported.
+
+    `vjp`: write gradients by the lagged frames, and the windows of the edges; see `frame_function`.
+    """
+    V, W = wp.types.vector(kind.dim, real), wp.types.vector(kind.window, real)
+    frame_vjp, put, closed = frame_function(kind, real, False), put_function(kind, real, True), kind.closed
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def vjp(
@@ -63,10 +83,7 @@ def frame_kernel(kind: RodKind, real, unit: bool = True, first: bool = True):
         n = count[r]
         if k >= n - wp.static(0 if closed else 1):
             return
-        e = x[along_node(k + 1, n), r] - x[k, r]
-        de, du, dt, _u, _t = wp.grad(carried)(
-            e, three(frame, 0, k, r), three(frame, 3, k, r), three(cotangent, 0, k, r), three(cotangent, 3, k, r)
-        )
+        de, du, dt = frame_vjp(x, frame, cotangent, k, n, r)
         f = W()
         for d in range(3):
             f[d] = de[d]
@@ -108,42 +125,46 @@ def gathered_function(kind: RodKind, real):
 
 
 @cache
+def lagged_function(kind: RodKind, real):
+    """Return the device function `add_lagged(lag, frame_out, k, n, r)`: add the lagged data of both vertices of edge k to its frame."""
+    previous, _ = node_functions(kind, real)
+
+    @wp.func
+    def add_lagged(lag: wp.array3d(dtype=real), frame_out: wp.array3d(dtype=real), k: int, n: int, r: int):
+        b = previous(k, n)
+        for c in range(6):
+            total = lag[c, k, r]
+            if b >= 0:
+                total += lag[6 + c, b, r]
+            frame_out[c, k, r] = frame_out[c, k, r] + total
+
+    return add_lagged
+
+
+@cache
 def gather_kernels(kind: RodKind, real):
     """Build the kernels that assemble element contributions.
 
-    The first writes the sums of windows at the dofs of a node, the second adds them. `edges`: add contributions by vertices' lagged
-    data to frames of edges.
+    `gather`: add the sums of windows at the dofs of a node. `edges`: add contributions by vertices' lagged data to frames of edges.
     """
     block, closed, gathered = kind.block, kind.closed, gathered_function(kind, real)
-    previous, _ = node_functions(kind, real)
+    add_lagged = lagged_function(kind, real)
 
-    def gather_kernel(adds: bool):
-        @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-        def gather(window_in: wp.array3d(dtype=real), count: wp.array(dtype=int), dof_out: wp.array3d(dtype=real)):
-            k, r = wp.tid()
-            n = count[r]
-            if k >= n:
-                return
-            q = gathered(window_in, k, n, r)
-            for d in range(wp.static(block)):
-                if wp.static(adds):
-                    dof_out[d, k, r] = dof_out[d, k, r] + q[d]
-                else:
-                    dof_out[d, k, r] = q[d]
-
-        return gather
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def gather(window_in: wp.array3d(dtype=real), count: wp.array(dtype=int), dof_out: wp.array3d(dtype=real)):
+        k, r = wp.tid()
+        n = count[r]
+        if k >= n:
+            return
+        q = gathered(window_in, k, n, r)
+        for d in range(wp.static(block)):
+            dof_out[d, k, r] = dof_out[d, k, r] + q[d]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def edges(lag_in: wp.array3d(dtype=real), count: wp.array(dtype=int), frame_out: wp.array3d(dtype=real)):
         k, r = wp.tid()
         n = count[r]
-        if k >= n - wp.static(0 if closed else 1):
-            return
-        b = previous(k, n)
-        for c in range(6):
-            total = lag_in[c, k, r]
-            if b >= 0:
-                total += lag_in[6 + c, b, r]
-            frame_out[c, k, r] = frame_out[c, k, r] + total
+        if k < n - wp.static(0 if closed else 1):
+            add_lagged(lag_in, frame_out, k, n, r)
 
-    return gather_kernel(False), gather_kernel(True), edges
+    return gather, edges

@@ -20,25 +20,22 @@ from ddg_warp.kernels.newton.edge_rotation import loose_function
 
 
 @cache
-def step_kernels(nodes: NodeStorage, real, midpoint: bool, drag: bool):
-    """Build the kernels of the end update and of inertia, for the nodes of all islands.
+def step_functions(nodes: NodeStorage, real, midpoint: bool, drag: bool):
+    """Build the device functions of the end update and of inertia, for a node.
 
-    `solution`: write gradients by the dofs of the solve, given gradients by the end of the step.
-    `inertia`: write gradients by the start of the step, masses, rate, damping and gravity, given the adjoint w of the solve. In the
-    coupled system, which may solve again for each friction lag, add them, and w to gradients by loads.
-    `start`: add gradients by the start of the step and by the rate, through the end update and fixed dofs.
+    `solution_of(...)`: gradient by the dofs of the solve, given gradients by the end of the step and `more`.
+    `inertia_of(...) -> (x, v, mass, gravity, rate, damping)`: gradients by the start of the step and the inputs of inertia, given the
+    adjoint w of the solve.
+    `start_of(...) -> (x, v, rate)`: these gradients with the contributions of the end update and of dofs that stay at the start.
 
     `more`: gradients by the dofs of the end through its frames and strains. `resisted`: inertia and drag of the coupled system. The
-    first `positions` nodes have weight, and the first `inert` nodes have inertia: joint rotations begin every step at zero.
+    first `positions` nodes have weight.
     """
-    coupled, dim, block, mass_type = nodes.coupled, nodes.dim, nodes.block, nodes.mass_type(real)
+    coupled, dim, block = nodes.coupled, nodes.dim, nodes.block
     settles = drag and midpoint  # then velocities of massless dofs are means over the step: `settle` of `forces.drag`
     V, B, State = wp.types.vector(dim, real), wp.types.vector(block, real), state_type(nodes, real)
-    items, _ = nodes.thread_functions
-    (dofs, store), (masses, store_masses) = dof_functions(nodes, real), mass_functions(nodes, real)
-    (row_of, store_row), free_components = row_functions(block, real), loose_function(block, real)
+    (dofs, _), free_components = dof_functions(nodes, real), loose_function(block, real)
     end_weight = real(2.0 if midpoint else 1.0)  # derivative of the end by the solution
-    start_weight = real(1.0 if midpoint else 0.0)  # derivative of the end by minus the start
     Inertia = block_inertia(real)
 
     @wp.func
@@ -55,11 +52,98 @@ def step_kernels(nodes: NodeStorage, real, midpoint: bool, drag: bool):
                     result[d] = real(1.0)
         return result
 
+    @wp.func
+    def solution_of(
+        end: State, more: B, m: B, resisted: wp.array2d(dtype=Inertia), inert: int, rate: real, k: int, island: int
+    ):
+        total = more * end_weight
+        if k < inert:
+            v = wp.cw_mul(rate_weight(m, resisted, k, island), dofs(end.v, end.omega, k, island))
+            total += dofs(end.x, end.theta, k, island) * end_weight + v * rate
+        return total
+
+    @wp.func
+    def inertia_of(
+        solution: B,
+        before: State,
+        w: B,
+        m: B,
+        positions: int,
+        rate: real,
+        damping: real,
+        gravity: V,
+        k: int,
+        island: int,
+    ):
+        c = rate * (rate + damping)
+        weighted = wp.cw_mul(m, w)
+        step = solution - dofs(before.x, before.theta, k, island)
+        velocity = dofs(before.v, before.omega, k, island)
+        force = velocity * rate - step * c
+        by_gravity = V()
+        if k < positions:
+            for d in range(wp.static(dim)):
+                force[d] = force[d] + gravity[d]
+                by_gravity[d] = weighted[d]
+        by_rate = -wp.dot(weighted, step * (real(2.0) * rate + damping) - velocity)
+        by_damping = -rate * wp.dot(weighted, step)
+        return weighted * c, weighted * rate, wp.cw_mul(w, force), by_gravity, by_rate, by_damping
+
+    @wp.func
+    def start_of(
+        by_x: B,
+        by_v: B,
+        by_rate: real,
+        end: State,
+        more: wp.array3d(dtype=real),
+        solution: B,
+        before: State,
+        by_dofs: B,
+        leaves: int,
+        m: B,
+        resisted: wp.array2d(dtype=Inertia),
+        rate: real,
+        k: int,
+        island: int,
+    ):
+        velocity = dofs(end.v, end.omega, k, island)
+        ended = wp.cw_mul(rate_weight(m, resisted, k, island), velocity)
+        x = by_x + free_components(leaves, by_dofs)
+        v = by_v
+        if wp.static(midpoint):  # the end is twice the solution less the start
+            for d in range(wp.static(block)):
+                x[d] = x[d] - more[d, k, island]
+            x -= dofs(end.x, end.theta, k, island)
+            v -= ended - velocity
+        step = solution - dofs(before.x, before.theta, k, island)
+        return x - ended * rate, v, by_rate + wp.dot(ended, step)
+
+    return solution_of, inertia_of, start_of
+
+
+@cache
+def step_kernels(nodes: NodeStorage, real, midpoint: bool, drag: bool):
+    """Build the kernels of the end update and of inertia; see `step_functions`.
+
+    `solution`: write gradients by the dofs of the solve, given gradients by the end of the step.
+    `inertia`: add gradients by the start of the step, loads, masses, rate, damping and gravity, given the adjoint w of the solve. The
+    coupled system may solve again for each friction lag.
+    `start`: add gradients by the start of the step and by the rate, through the end update and fixed dofs.
+
+    The first `inert` nodes have inertia: joint rotations begin every step at zero. The first two are of the coupled system; see
+    `rod_step` for rods.
+    """
+    dim, block, mass_type = nodes.dim, nodes.block, nodes.mass_type(real)
+    V, State, Inertia = wp.types.vector(dim, real), state_type(nodes, real), block_inertia(real)
+    items, _ = nodes.thread_functions
+    (dofs, store), (masses, store_masses) = dof_functions(nodes, real), mass_functions(nodes, real)
+    row_of, store_row = row_functions(block, real)
+    solution_of, inertia_of, start_of = step_functions(nodes, real, midpoint, drag)
+
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def solution(
         end: State,
         more: wp.array3d(dtype=real),
-        fixed: wp.array2d(dtype=wp.uint8),
         mass: wp.array2d(dtype=mass_type),
         rotary: wp.array2d(dtype=real),
         resisted: wp.array2d(dtype=Inertia),
@@ -67,22 +151,14 @@ def step_kernels(nodes: NodeStorage, real, midpoint: bool, drag: bool):
         inert: int,
         rate: wp.array(dtype=real),
         dof_out: wp.array3d(dtype=real),
-        right_out: wp.array3d(dtype=real),
     ):
-        """Write gradients by dofs; of rods, too, the right-hand side of the adjoint solve, which is zero at fixed dofs."""
         i, j = wp.tid()
         island, k = items(i, j)
         if k >= count[island]:
             return
-        total = row_of(more, k, island) * end_weight
-        if k < inert:
-            v = wp.cw_mul(
-                rate_weight(masses(mass, rotary, k, island), resisted, k, island), dofs(end.v, end.omega, k, island)
-            )
-            total += dofs(end.x, end.theta, k, island) * end_weight + v * rate[island]
+        m = masses(mass, rotary, k, island)
+        total = solution_of(end, row_of(more, k, island), m, resisted, inert, rate[island], k, island)
         store_row(dof_out, k, island, total)
-        if wp.static(not coupled):
-            store_row(right_out, k, island, free_components(int(fixed[k, island]), total))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def inertia(
@@ -107,45 +183,25 @@ def step_kernels(nodes: NodeStorage, real, midpoint: bool, drag: bool):
         gravity_out: wp.array2d(dtype=V),
         load_out: wp.array3d(dtype=real),
     ):
-        """Write or add gradients of the residual; x and theta are the solution, `gravity` is by world."""
+        """Add gradients of the residual; x and theta are the solution, `gravity` is by world."""
         i, j = wp.tid()
         island, k = items(i, j)
         if k >= count[island]:
             return
         residual = row_of(w, k, island)
-        if wp.static(coupled):
-            store_row(load_out, k, island, row_of(load_out, k, island) + residual)
+        store_row(load_out, k, island, row_of(load_out, k, island) + residual)
         if k >= inert:
             return
-        rho = rate[island]
-        c = rho * (rho + damping[0])
-        weighted = wp.cw_mul(masses(mass, rotary, k, island), residual)
-        step = dofs(x, theta, k, island) - dofs(before.x, before.theta, k, island)
-        velocity = dofs(before.v, before.omega, k, island)
-        force = velocity * rho - step * c
-        by_gravity = V()
-        if k < positions:
-            for d in range(wp.static(dim)):
-                force[d] = force[d] + gravity[world[island]][d]
-                by_gravity[d] = weighted[d]
-        by_x = weighted * c
-        by_v = weighted * rho
-        by_mass = wp.cw_mul(residual, force)
-        grad_inverse_step = -wp.dot(weighted, step * (real(2.0) * rho + damping[0]) - velocity)
-        by_damping = -rho * wp.dot(weighted, step)
-        if wp.static(coupled):
-            by_x += dofs(out.x, out.theta, k, island)
-            by_v += dofs(out.v, out.omega, k, island)
-            by_mass += masses(mass_out, rotary_out, k, island)
-            by_gravity += gravity_out[k, island]
-            grad_inverse_step += rate_out[k, island]
-            by_damping += damping_out[k, island]
-        store(out.x, out.theta, k, island, by_x)
-        store(out.v, out.omega, k, island, by_v)
-        store_masses(mass_out, rotary_out, k, island, by_mass)
-        gravity_out[k, island] = by_gravity
-        rate_out[k, island] = grad_inverse_step
-        damping_out[k, island] = by_damping
+        solution, m, g = dofs(x, theta, k, island), masses(mass, rotary, k, island), gravity[world[island]]
+        by_x, by_v, by_mass, by_gravity, by_rate, by_damping = inertia_of(
+            solution, before, residual, m, positions, rate[island], damping[0], g, k, island
+        )
+        store(out.x, out.theta, k, island, by_x + dofs(out.x, out.theta, k, island))
+        store(out.v, out.omega, k, island, by_v + dofs(out.v, out.omega, k, island))
+        store_masses(mass_out, rotary_out, k, island, by_mass + masses(mass_out, rotary_out, k, island))
+        gravity_out[k, island] = by_gravity + gravity_out[k, island]
+        rate_out[k, island] = by_rate + rate_out[k, island]
+        damping_out[k, island] = by_damping + damping_out[k, island]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def start(
@@ -170,16 +226,25 @@ def step_kernels(nodes: NodeStorage, real, midpoint: bool, drag: bool):
         island, k = items(i, j)
         if k >= count[island] or k >= inert:
             return
-        velocity = dofs(end.v, end.omega, k, island)
-        ended = wp.cw_mul(rate_weight(masses(mass, rotary, k, island), resisted, k, island), velocity)
-        by_x = dofs(out.x, out.theta, k, island)
-        by_x += free_components(int(leaves[k, island]), row_of(dof_gradient, k, island))
-        by_x -= (dofs(end.x, end.theta, k, island) + row_of(more, k, island)) * start_weight
-        store(out.x, out.theta, k, island, by_x - ended * rate[island])
-        by_v = dofs(out.v, out.omega, k, island) - (ended - velocity) * start_weight
+        by_x, by_v, by_rate = start_of(
+            dofs(out.x, out.theta, k, island),
+            dofs(out.v, out.omega, k, island),
+            rate_out[k, island],
+            end,
+            more,
+            dofs(x, theta, k, island),
+            before,
+            row_of(dof_gradient, k, island),
+            int(leaves[k, island]),
+            masses(mass, rotary, k, island),
+            resisted,
+            rate[island],
+            k,
+            island,
+        )
+        store(out.x, out.theta, k, island, by_x)
         store(out.v, out.omega, k, island, by_v)
-        step = dofs(x, theta, k, island) - dofs(before.x, before.theta, k, island)
-        rate_out[k, island] = rate_out[k, island] + wp.dot(ended, step)
+        rate_out[k, island] = by_rate
 
     return solution, inertia, start
 
