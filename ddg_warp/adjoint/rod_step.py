@@ -122,9 +122,9 @@ class RodStepAdjoint:
         accelerations = {"a", "alpha"}
         of_end = accelerations | {"v", "omega"} | (set() if kind.viscous else {"frame", "last"})
         self.unread = accelerations, of_end, accelerations
-        # parts whose contributions come between those of elements and of the end update
-        parts = (self.supports, self.drag, self.followers, self.predictor)
-        self._complete = scheme is not None and not any(parts)
+        # these add their contributions before the end update
+        between = (self.supports, self.drag, self.followers, self.predictor)
+        self._complete = scheme is not None and not any(between)
         self._end, self._start = rod_step_kernels(kind, real, midpoint, self._complete)
         *_, self._update = time_step.step_kernels(kind.nodes, real, midpoint, kind.drag)
         leaves = np.tile(~group.host.fixed | _moved(group), (1, group.worlds))

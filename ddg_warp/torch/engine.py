@@ -298,7 +298,7 @@ class Engine:
         return self.adjoint
 
     def _indices_but(self, unread: list[set[str]]) -> list[int]:
-        """Return the indices of all fields but those that each rod group does not read."""
+        """Return the indices of fields, except the names that each rod group leaves unread."""
         names = {f"{i}/{name}" for i, each in enumerate(unread) for name in each}
         return [i for i, field in enumerate(self.fields) if field.name not in names]
 

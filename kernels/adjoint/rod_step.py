@@ -21,9 +21,8 @@ def rod_step_kernels(kind: RodKind, real, midpoint: bool, complete: bool):
 
     `end`: write gradients by the dofs of the solve and by its lagged frames, given gradients by the end of the step, and the right-hand
     side of the adjoint solve.
-    `start`: write gradients by the start of the step and the inputs of inertia, given the adjoint w of the solve; add the element
-    contributions to gradients by dofs and frames. If not `complete`, contributions of the end update are missing, see
-    `time_step.step_kernels`.
+    `start`: write gradients by the start of the step and the inputs of inertia, given the adjoint w of the solve. Add the element
+    contributions to gradients by dofs and frames. If `complete`, include the end update; else see `time_step.step_kernels`.
     """
     nodes, block, twist, closed, viscous = kind.nodes, kind.block, kind.twist, kind.closed, kind.viscous
     V, B, State = wp.types.vector(kind.dim, real), wp.types.vector(block, real), state_type(nodes, real)
