@@ -13,7 +13,7 @@ THREADS = 256  # threads of that block
 
 @wp.func
 def add_to_tile(tiles: wp.array(dtype=int), k: int, value: int):
-    """Add entry k to the sum of its tile; without tiles (on the CPU) do nothing."""
+    """Add entry k to the sums of tiles; do nothing without tiles, as on the CPU."""
     if tiles.shape[0] > 0:
         wp.atomic_add(tiles, k / wp.static(TILE), value)
 
