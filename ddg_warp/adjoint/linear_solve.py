@@ -187,7 +187,7 @@ class DirectSolve:
         if automatic(group) == "cyclic_reduction":
             self.solver = CyclicReduction(kind.block, *size, precision_of_factors, device, repeated=linear is not None)
         else:
-            self.solver = Elimination(kind, *size, precision_of_factors, device)
+            self.solver = Elimination(kind, *size, precision_of_factors, device, once=linear is None)
         self.failed = self.system.islands.lost_pivots
         if linear is not None:
             self._product = iterative_refinement.product_kernel(kind, real)

@@ -278,6 +278,71 @@ def factor_function(nb: int, span: int, linear, tensions: int = 0):
 
 
 @cache
+def solve_function(nb: int, span: int, linear):
+    """Return the device function `solve(blocks, v, factor, out, n, r) -> lost pivots`: out = H^-1 v along an open rod of n nodes.
+
+    For one right-hand side, of which each node is read before it is written. `factor` is scratch, 2 nb^2 rows of every node.
+    """
+    nb2 = nb**2
+    H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
+    load, store, vector, store_vector = block_functions(nb, linear)
+    eliminate, lower, upper, lower_vector, upper_vector, congruence = block_ldlt.functions(nb, linear)
+
+    @wp.func
+    def solve(
+        blocks: wp.array3d(dtype=linear),
+        v: wp.array3d(dtype=linear),
+        factor: wp.array3d(dtype=linear),
+        out: wp.array3d(dtype=linear),
+        n: int,
+        r: int,
+    ):
+        lost = int(0)
+        # updates by the nodes before: of this node, of its coupling, and of the next node
+        minus = M()
+        minus_couple = M()
+        minus_next = M()
+        before = H()
+        before_next = H()
+        for j in range(n):
+            L, inverse, lost_here = eliminate(load(blocks, 0, j, r) - minus)
+            lost += lost_here
+            w = vector(v, 0, j, r) - before
+            store_vector(out, 0, j, r, upper_vector(L, inverse, lower_vector(L, w)))
+            B = M()
+            if j < n - 1:
+                B = load(blocks, wp.static(nb2), j, r) - minus_couple
+            Zb = lower(L, B)
+            U = upper(L, inverse, Zb)
+            store(factor, 0, j, r, U)
+            minus = minus_next + congruence(Zb, inverse, Zb)
+            before = before_next + w * U
+            if wp.static(span == 2):
+                C = M()
+                if j < n - 2:
+                    C = load(blocks, wp.static(2 * nb2), j, r)
+                Zc = lower(L, C)
+                V = upper(L, inverse, Zc)
+                store(factor, wp.static(nb2), j, r, V)
+                minus_couple = congruence(Zb, inverse, Zc)
+                minus_next = congruence(Zc, inverse, Zc)
+                before_next = w * V
+        e1 = H()
+        e2 = H()
+        for i in range(n):
+            j = n - 1 - i
+            u = vector(out, 0, j, r) - load(factor, 0, j, r) * e1
+            if wp.static(span == 2):
+                u -= load(factor, wp.static(nb2), j, r) * e2
+            store_vector(out, 0, j, r, u)
+            e2 = e1
+            e1 = u
+        return lost
+
+    return solve
+
+
+@cache
 def substitute_function(nb: int, span: int, linear, tensions: int = 0):
     """Return the device function `substitute(factor, v, out, n, r, s)`: out = (L D L^T)^-1 v along an open rod.
 
