@@ -129,7 +129,7 @@ class CoupledStepAdjoint:
         )
         self._damping = wp.array([model.scene.mass_damping], dtype=real, device=self.device)
         storages = [coupled_storage(part.term, real) for part in coupled.sets]
-        self._vjp = [elements.pull_kernel(storage, 0, real, True, True) for storage in storages]
+        self._vjp = [elements.pull_kernel(storage, real, True, True) for storage in storages]
         self._strains = [
             elements.strain_vjp_kernel(storage, 0, real, True) if part.term.density.lagged else None
             for storage, part in zip(storages, coupled.sets, strict=True)

@@ -116,7 +116,7 @@ class RodStepAdjoint:
         self.predictor = RodPredictor.of(model, group, motion, scheme)
         terms = range(len(kind.terms))
         storage, viscous = rod_storage(kind, real), kind.viscous
-        self._vjp = [elements.pull_kernel(storage, i, real, False, viscous) for i in terms]
+        self._vjp = elements.pull_kernel(storage, real, False, viscous)
         self._strain = [elements.strain_vjp_kernel(storage, i, real, False) for i in terms] if viscous else []
         self._nodes, self._edges = rod_elements.gather_kernels(kind, real)
         accelerations = {"a", "alpha"}
@@ -235,8 +235,7 @@ class RodStepAdjoint:
             device_arrays.clear(inputs.rate)
         read = [group.element_inputs(kept, before.last, self._rate), inputs.load]
         written = [*map(device_arrays.columns, (window, lag, inputs.parameters, start.last, inputs.rate))]
-        for kernel in self._vjp:
-            self._launch(kernel, read, written)
+        self._launch(self._vjp, read, written)
         solution = [end, cotangents.end, kept.x, kept.theta, began]
         read = [*solution, inputs.load, window, lag, self._leaves, *masses, group.count]
         read += [self._rate, self._damping, self.gravity, group.world]
@@ -266,7 +265,7 @@ class RodStepAdjoint:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        result = [*self._vjp, *self._strain, self._end, self._start, *self.solve.kernels]
+        result = [self._vjp, *self._strain, self._end, self._start, *self.solve.kernels]
         result += [] if self._complete else [self._nodes, self._update]
         result += [self._edges] if self._strain else []
         parts = (self.supports, self.drag, self.followers, self.predictor)

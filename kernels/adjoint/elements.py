@@ -14,25 +14,10 @@ from ddg_warp.kernels.elements.variation import variation_functions
 
 
 @cache
-def _write_functions(storage: ElementStorage, index: int, real, adds: bool):
-    """Return the device functions `present`, `write` and `write_lagged`, which write contributions of a term, or add with
-    `adds`.
-
-    The terms of an element have one window: the first writes it, zero where the term has no element, and others add.
-    """
-    access, Inputs, W = storage.terms[index], storage.Inputs, storage.Window
-    measure, count_of, whole_of = access.term.measure, storage.count, storage.whole
-    span, rows = measure.span, measure.lag_size + measure.data_size
-    write, first = write_function(storage, real, real, adds or index > 0), not adds and index == 0
-    Rows, S = wp.array2d(dtype=wp.types.vector(3, real) if storage.slots else real), measure.types(real)[1]
-
-    @wp.func
-    def present(inputs: Inputs, island: int, e: int, column: int, window_out: Rows):
-        if e < count_of(inputs, island) and (wp.static(span != 2) or whole_of(inputs, island, e)):
-            return True
-        if wp.static(first):
-            write(window_out, 0, W(), column)
-        return False
+def _write_lagged_function(storage: ElementStorage, index: int, real, adds: bool):
+    """Return the device function `write_lagged`: write contributions of a term to lagged data, or add them with `adds`."""
+    measure = storage.terms[index].term.measure
+    rows, S = measure.lag_size + measure.data_size, measure.types(real)[1]
 
     @wp.func
     def write_lagged(out: wp.array2d(dtype=real), f: S, column: int):
@@ -42,56 +27,66 @@ def _write_functions(storage: ElementStorage, index: int, real, adds: bool):
             else:
                 out[i, column] = f[i]
 
-    return present, write, write_lagged
+    return write_lagged
 
 
 @cache
-def pull_kernel(storage: ElementStorage, index: int, real, adds: bool, measured: bool):
-    """Build the reverse of the element forces of a term: derivatives of -w . dE/dq by all inputs of an element.
+def _write_functions(storage: ElementStorage, index: int, real, adds: bool):
+    """Return the device functions `present`, `write` and `write_lagged`, which write contributions of a term, or add with
+    `adds`.
 
-    `vjp`: write the derivatives by the window, lagged and constant data, rest measure, parameters in the rows of the term,
-    and strains of the last step. Add the derivative by the inverse step length.
-
-    Args:
-        adds: True to add all of these.
-        measured: True to add the derivatives by the rest measure, where `strain_vjp_kernel` has written some.
+    The terms of an element have one window: the first writes it, zero where the term has no element, and others add.
     """
+    measure, count_of, whole_of = storage.terms[index].term.measure, storage.count, storage.whole
+    write, first = write_function(storage, real, real, adds or index > 0), not adds and index == 0
+    Inputs, W, Rows = (
+        storage.Inputs,
+        storage.Window,
+        wp.array2d(dtype=wp.types.vector(3, real) if storage.slots else real),
+    )
+
+    @wp.func
+    def present(inputs: Inputs, island: int, e: int, column: int, window_out: Rows):
+        if e < count_of(inputs, island) and (wp.static(measure.span != 2) or whole_of(inputs, island, e)):
+            return True
+        if wp.static(first):
+            write(window_out, 0, W(), column)
+        return False
+
+    return present, write, _write_lagged_function(storage, index, real, adds)
+
+
+@cache
+def _pull_function(storage: ElementStorage, index: int, real, adds: bool, measured: bool):
+    """Return the device function `pull`: write the derivatives of a term; return the one by the window. See `pull_kernel`."""
     access, Inputs = storage.terms[index], storage.Inputs
     term, density, local, short, spread = access.term, access.term.density, access.local, access.short, access.spread
-    n = len(term.measure.strains)
+    n, two = len(term.measure.strains), term.measure.span == 2
     size, rows, lagged = density.parameter_size(n), len(term.parameter_names) - 1, density.lagged
-    E = term.measure.types(real)[2]
-    items, read, displacement, column_of = storage.items, storage.read, storage.displacement, storage.column
+    E, read, displacement = term.measure.types(real)[2], storage.read, storage.displacement
     along, _ = variation_functions(term, real)
-    parameters, two = parameter_function(storage, index, real), term.measure.span == 2
-    present, write, write_lagged = _write_functions(storage, index, real, adds)
-    Rows, row, strain = (
-        wp.array2d(dtype=wp.types.vector(3, real) if storage.slots else real),
-        access.parameter,
-        access.strain,
+    parameters, write_lagged = (
+        parameter_function(storage, index, real),
+        _write_lagged_function(storage, index, real, adds),
     )
-    Displacements, measured = storage.Displacements, adds or measured
+    row, strain, Displacements, measured = access.parameter, access.strain, storage.Displacements, adds or measured
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def vjp(
+    @wp.func
+    def pull(
         inputs: Inputs,
         w: Displacements,
-        window_out: Rows,
         lagged_out: wp.array2d(dtype=real),
         parameter_out: wp.array2d(dtype=real),
         last_out: wp.array2d(dtype=real),
         rate_out: wp.array(dtype=real),
+        island: int,
+        e: int,
+        column: int,
     ):
-        i, j = wp.tid()
-        island, e = items(i, j)
-        column = column_of(inputs, island, e)
-        if not present(inputs, island, e, column, window_out):
-            return
         measure, p = parameters(inputs, island, e, column)
         q, s = read(inputs, island, e, wp.static(two))
         v = -local(displacement(inputs, w, island, e, wp.static(two)))
         dq, ds, dmeasure, dp, _dv, _de = wp.grad(along)(local(q), short(s), measure, p, v, E())
-        write(window_out, 0, spread(dq), column)
         write_lagged(lagged_out, ds, column)
         if wp.static(measured):
             dmeasure += parameter_out[wp.static(row), column]
@@ -106,6 +101,54 @@ def pull_kernel(storage: ElementStorage, index: int, real, adds: bool, measured:
                     dp[wp.static(rows) + m] += last_out[wp.static(strain) + m, column]
                 last_out[wp.static(strain) + m, column] = dp[wp.static(rows) + m]
             rate_out[column] = rate_out[column] + dp[wp.static(size - 1)]
+        return spread(dq)
+
+    return pull
+
+
+@cache
+def pull_kernel(storage: ElementStorage, real, adds: bool, measured: bool):
+    """Build the reverse of the element forces of all terms: derivatives of -w . dE/dq by all inputs of an element.
+
+    `vjp`: write the derivatives by the window, zero without an element, by lagged and constant data, rest measure, parameters, and
+    strains of the last step. Add the derivative by the inverse step length.
+
+    Args:
+        adds: True to add all of these.
+        measured: True to add the derivatives by the rest measure, where `strain_vjp_kernel` has written some.
+    """
+    Inputs, W, Displacements = storage.Inputs, storage.Window, storage.Displacements
+    items, count_of, whole_of, column_of = storage.items, storage.count, storage.whole, storage.column
+    measures = [access.term.measure for access in storage.terms]
+    first_everywhere, last_everywhere, several = measures[0].span != 2, measures[-1].span != 2, len(measures) > 1
+    first_term, last_term = (_pull_function(storage, index, real, adds, measured) for index in (0, -1))
+    write = write_function(storage, real, real, adds)
+    Rows = wp.array2d(dtype=wp.types.vector(3, real) if storage.slots else real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def vjp(
+        inputs: Inputs,
+        w: Displacements,
+        window_out: Rows,
+        lagged_out: wp.array2d(dtype=real),
+        parameter_out: wp.array2d(dtype=real),
+        last_out: wp.array2d(dtype=real),
+        rate_out: wp.array(dtype=real),
+    ):
+        i, j = wp.tid()
+        island, e = items(i, j)
+        column = column_of(inputs, island, e)
+        f = W()
+        if e < count_of(inputs, island):
+            whole = whole_of(inputs, island, e)
+            if wp.static(several):
+                if wp.static(last_everywhere) or whole:
+                    f += last_term(inputs, w, lagged_out, parameter_out, last_out, rate_out, island, e, column)
+            if wp.static(first_everywhere) or whole:
+                f += first_term(inputs, w, lagged_out, parameter_out, last_out, rate_out, island, e, column)
+        elif wp.static(adds):
+            return
+        write(window_out, 0, f, column)
 
     return vjp
 

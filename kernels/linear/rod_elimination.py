@@ -61,7 +61,7 @@ def elimination_kernels(kind: RodKind, linear):
 
 @cache
 def solve_kernel(kind: RodKind, linear):
-    """Build the kernel that solves every wanted open rod for one right-hand side as it factorises the matrix."""
+    """Build the kernel of a factorisation with one right-hand side, of every wanted open rod."""
     eliminate = rod_matrix.solve_function(kind.block, kind.span, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
