@@ -23,8 +23,6 @@ TESTED_BY = {
     "kernels/adjoint": ("adjoint/test_adjoint.py", "vjp_of_steps"),
     "kernels/adjoint/contact_parameters": ("adjoint/test_contact_adjoint.py", "number_shifts"),
     "kernels/adjoint/coupled_linear_solve": ("adjoint/test_coupled_solve.py", "ExactSystem"),
-    "kernels/adjoint/float32_error": ("torch/test_torch.py", "test_float32_solves_for_the_noninertial_gradient"),
-    "kernels/adjoint/iterative_refinement": ("torch/test_torch.py", "test_mixed_precision_is_close_to_float64"),
     "kernels/collision/broad_phase": ("collision/test_broad_phase.py", "BroadPhase"),
     "kernels/collision/contact": ("collision/test_pair_terms.py", "hessian_product"),
     "kernels/collision/contact/query": ("collision/test_hard_contacts.py", "model.contacts"),

@@ -183,8 +183,8 @@ class CoupledStepAdjoint:
         parts = (self._shares, self.solve, self.supports, self.drag, self.followers, self.predictor, self.contact)
         return result + [kernel for part in parts if part for kernel in part.kernels]
 
-    def suit(self, step, s: float, parameters_changed: bool = False) -> bool:
-        """Select the solvers of reverse solves of a `CoupledStep` over s [s]; return True if the selection changed."""
+    def suit(self, step, s: float) -> bool:
+        """Prepare for solves of a `CoupledStep` over s [s]; return True if kernels or arrays have changed."""
         return self.predictor is not None and self.predictor.suit(step, s)
 
     def upload(self, t0: float, t1: float) -> None:

@@ -114,15 +114,11 @@ class Adjoint:
             _require_minimum(adjoint, part)
         return gradients
 
-    def upload(self, start: float, dt: float, other_parameters: bool = False) -> bool:
-        """Upload prescribed data and select the linear solvers for a backward pass; return True if a captured graph is outdated.
-
-        Args:
-            other_parameters: True if parameters may differ from the model's.
-        """
+    def upload(self, start: float, dt: float) -> bool:
+        """Upload prescribed data for a backward pass; return True if a captured graph is outdated."""
         s, changed = self.integrator._solved(dt), False
         for adjoint, part in zip(self.parts, self.integrator._parts, strict=True):
-            changed = adjoint.suit(part, s, other_parameters) or changed
+            changed = adjoint.suit(part, s) or changed
             adjoint.upload(start, start + dt)
         return changed
 

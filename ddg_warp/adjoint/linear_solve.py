@@ -10,7 +10,6 @@ from scipy.sparse.linalg import splu
 
 from ddg_warp import device_arrays
 from ddg_warp.errors import SolverError
-from ddg_warp.kernels.adjoint import float32_error, iterative_refinement
 from ddg_warp.solve.equilibrium.rigid_modes import rigid_modes
 from ddg_warp.solve.equilibrium.rod_tangent import RodTangent
 from ddg_warp.solve.linear.cyclic_reduction import CyclicReduction, Elimination
@@ -19,8 +18,6 @@ from ddg_warp.solve.linear.sparse_direct import SingularError, regular
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
 from ddg_warp.solve.newton.rod_newton_assembled import AssembledNewton
 
-CLOSE = 1e-5  # accepted relative error of w from refined float32 solutions; roll-outs amplify it ...
-PASSES = 2  # ... which limits refinement. Measured: with 3 passes, an error of 1e-2 each, gradients erred by 1e-3
 SINGULAR = 1e-6  # Accepted relative residual; a singular matrix that was regularised leaves more
 
 
@@ -162,44 +159,30 @@ def _transposed(matrix: sparse.csc_matrix):
 
 
 class DirectSolve:
-    """Device solver of H w = g of a rod group.
+    """Device solver of H w = g of a rod group, by assembled blocks and their elimination or cyclic reduction.
 
-    The system is assembled in blocks and factorised by block elimination or cyclic reduction; in another precision than the state's
-    with iterative refinement.
-
-    Measured: the sweep of Newton's method with second derivatives keeps more in float64 than a GPU has registers.
-
-    Args:
-        linear: precision of the factors; by default that of the state.
+    Measured (H100, 100,000 rods of 24 nodes, where float32 factors needed two solutions with refinement): all of the reverse pass
+    took 7.5 ms with these, 6.4 ms in float64. The sweep of Newton's method with second derivatives keeps 2 kB a thread in local memory
+    in float64: 8.4 ms.
 
     Attributes:
         failed: nonzero for rods with an H that is not positive definite (columns,), where w is meaningless.
-        passes: number of solutions summed in iterative refinement; 0 without.
     """
 
-    def __init__(self, model, group, linear=None):
-        self.group, self.passes = group, 0
-        kind, device, real = group.kind, model.wp_device, model.types.real
-        arguments, size = (model, group, NewtonOptions(psd="none"), real), (group.nodes, group.columns)
-        self._wanted = wp.full(group.columns, 1, dtype=int, device=device)
-        self.system = AssembledNewton(*arguments, stored=linear)
-        precision_of_factors = linear or real
+    def __init__(self, model, group):
+        kind, device, real, size = group.kind, model.wp_device, model.types.real, (group.nodes, group.columns)
+        self._count, self._wanted = group.count, wp.full(group.columns, 1, dtype=int, device=device)
+        self.system = AssembledNewton(model, group, NewtonOptions(psd="none"), real)
         if automatic(group) == "cyclic_reduction":
-            self.solver = CyclicReduction(kind.block, *size, precision_of_factors, device, repeated=linear is not None)
+            self.solver = CyclicReduction(kind.block, *size, real, device)
         else:
-            self.solver = Elimination(kind, *size, precision_of_factors, device, once=linear is None)
+            self.solver = Elimination(kind, *size, real, device, once=True)
         self.failed = self.system.islands.lost_pivots
-        if linear is not None:
-            self._product = iterative_refinement.product_kernel(kind, real)
-            self._guess, self._rest, self._add = iterative_refinement.refine_kernels(kind, real, linear)
-            self._elements = device_arrays.allocate((kind.window, *size), real, device)
-            self._right, self._found = self.system.vectors(), self.system.vectors()
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        refined = [self._product, self._guess, self._rest, self._add] if self.passes else []
-        return [(self.system._evaluate, 128), self.system._assemble, *self.solver.kernels, *refined]
+        return [(self.system._evaluate, 128), self.system._assemble, *self.solver.kernels]
 
     def __call__(self, solved, last: wp.array, rate: float, coefficient: float, rhs: wp.array, w: wp.array, resisted):
         """Write w; launches only. Arguments as of `RodLinearSolve`, `coefficient` that of inertia [1/s^2]."""
@@ -215,98 +198,28 @@ class DirectSolve:
             adjoint.drag.resist(*states, loading.mass, loading.rotary, system.iterates.target_angle, islands)
         system.evaluate(last)
         system.assemble_blocks()
-        if not self.passes:
-            self._solve(rhs, w)
-            return
-        nodes, count = w.shape[1:], self.group.count
-        self._launch(self._guess, nodes, [rhs, loading.mass, islands.inertia_coefficient], [w])
-        for done in range(self.passes):
-            read = [system.elements.factor, system.elements.geometric, w, count]
-            self._launch(self._product, nodes, read, [self._elements])
-            read = [
-                rhs,
-                w,
-                self._elements,
-                loading.mass,
-                loading.rotary,
-                islands.inertia_coefficient,
-                self.group.fixed,
-                count,
-            ]
-            self._launch(self._rest, nodes, read, [self._right])
-            self._solve(self._right, self._found, again=done > 0)
-            self._launch(self._add, w.shape, [self._found], [w])
-
-    def _solve(self, rhs: wp.array, solution: wp.array, again: bool = False) -> None:
-        system = self.system
-        self.solver.solve(
-            system.blocks, rhs, self.group.count, self._wanted, solution, system.islands.lost_pivots, again
-        )
-
-    def _launch(self, kernel, shape: tuple, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, shape, inputs, outputs, device=self.system.device)
+        self.solver.solve(system.blocks, rhs, self._count, self._wanted, w, self.failed)
 
 
 class RodLinearSolve:
     """Solver of H w = g of a rod group, in the precision of its state; of equilibria on the host.
 
-    Factors have the precision of the model's linear algebra if accurate enough.
-
     Attributes:
         tangent: tangent of host solves.
         held: see `HostSolve`, of the last host solve, in the layout of w.
-        system: the `DirectSolve`.
-        exact: a `DirectSolve` in the precision of the state, selected on the device by the values of parameter tensors; None if
-            parameters are the model's or `system` has that precision.
-        failed: of the last direct solve, see `DirectSolve`.
+        direct: the `DirectSolve`; failed: of its last solve.
     """
 
     def __init__(self, model, group):
         self.model, self.group = model, group
-        self.host = HostSolve(RodTangent(model, group, 0))
+        self.host, self.direct = HostSolve(RodTangent(model, group, 0)), DirectSolve(model, group)
         self.tangent, self.held = self.host.tangent, None
-        self.system, self.exact, self._for = DirectSolve(model, group), None, None
-        self.failed = self.system.failed
-
-    def suit(self, s: float, other_parameters: bool = False) -> bool:
-        """Select precision and refinement passes for steps of s [s], so that the error of w is below `CLOSE`; return True if changed.
-
-        Args:
-            other_parameters: True if parameters may differ from the model's; the device then checks the values.
-        """
-        model, kind = self.model, self.group.kind
-        if model.types.linear is model.types.real:
-            return False
-        changed = False
-        if self._for != (s, model.version):
-            self._for = s, model.version
-            error = 1.0 if kind.drag or kind.closed else float(self.group.float32_errors(s).max())
-            passes = next((n for n in range(1, PASSES + 1) if error**n <= CLOSE), 0)
-            changed = passes != self.system.passes
-            if bool(passes) != bool(self.system.passes):
-                self.system, self.exact = DirectSolve(model, self.group, model.types.linear if passes else None), None
-                self.failed = self.system.failed
-            self.system.passes = passes
-        if other_parameters and self.exact is None and self.system.passes:
-            self._watch()
-            changed = True
-        return changed
-
-    def _watch(self) -> None:
-        group, real, device = self.group, self.model.types.real, self.model.wp_device
-        self.exact = DirectSolve(self.model, group)
-        self.failed = wp.zeros_like(self.system.failed)
-        self._measure, self._judge = float32_error.stiffness_kernels(group.kind, real)
-        self._poor = wp.zeros(1, dtype=int, device=device)
-        self._rate = wp.zeros(group.columns, dtype=real, device=device)
-        parts = -(-group.nodes // float32_error.SEGMENT)
-        self._found = wp.zeros((float32_error.ROWS, parts, group.columns), dtype=real, device=device)
+        self.failed = self.direct.failed
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        watch = [*self.exact.kernels, self._measure, self._judge] if self.exact else []
-        return [*self.system.kernels, *watch]
+        return self.direct.kernels
 
     def __call__(self, solved, last: wp.array, s: float, rhs: wp.array, w: wp.array, resisted=None) -> None:
         """Write w (block, n, R), zero at fixed dofs, for a right-hand side that is zero there.
@@ -322,26 +235,11 @@ class RodLinearSolve:
         """
         rate = 1.0 / s
         coefficient = rate * (rate + self.model.scene.mass_damping)
-        if not rate:
-            more = resisted[0].matrix(*resisted[1:], rate) if resisted else None
-            self._on_host(solved, last, rate, coefficient, rhs, w, more)
+        if rate:
+            self.direct(solved, last, rate, coefficient, rhs, w, resisted)
             return
-        arguments = solved, last, rate, coefficient, rhs, w, resisted
-        if self.exact is None:
-            self.system(*arguments)
-            return
-        group, device = self.group, self.model.wp_device
-        self._poor.zero_()
-        self._rate.fill_(rate)
-        read = [*group.parameters.arrays, group.mass, group.count]
-        wp.launch(self._measure, self._found.shape[1:], read, [self._found], device=device)
-        read = [self._found, group.length, group.count, self._rate, CLOSE ** (1.0 / self.system.passes)]
-        wp.launch(self._judge, group.columns, read, [self._poor], device=device)
-        wp.capture_if(self._poor, lambda: self._by(self.exact, arguments), lambda: self._by(self.system, arguments))
-
-    def _by(self, direct: DirectSolve, arguments: tuple) -> None:
-        direct(*arguments)
-        wp.copy(self.failed, direct.failed)
+        more = resisted[0].matrix(*resisted[1:], rate) if resisted else None
+        self._on_host(solved, last, rate, coefficient, rhs, w, more)
 
     def _on_host(self, solved, last, rate: float, coefficient: float, rhs: wp.array, w: wp.array, more) -> None:
         data = SimpleNamespace(x=solved.x, theta=solved.theta, frame=solved.frame, last=last)

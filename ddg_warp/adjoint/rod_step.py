@@ -158,14 +158,9 @@ class RodStepAdjoint:
             drag=self.drag.by_coefficients if self.drag else None,
         )
 
-    def suit(self, step, s: float, parameters_changed: bool = False) -> bool:
-        """Select the solvers of reverse solves of a `RodStep` over s [s]; return True if the selection changed.
-
-        Args:
-            parameters_changed: True if parameters may differ from the model's.
-        """
-        changed = self.predictor is not None and self.predictor.suit(step, s)
-        return self.solve.suit(s, parameters_changed) or changed
+    def suit(self, step, s: float) -> bool:
+        """Prepare for solves of a `RodStep` over s [s]; return True if kernels or arrays have changed."""
+        return self.predictor is not None and self.predictor.suit(step, s)
 
     def upload(self, t0: float, t1: float) -> None:
         """Upload supports, follower loads and flow between t0 and t1, the step to reverse."""

@@ -207,7 +207,7 @@ class Engine:
         ):
             self.fill([targets[i] for i in read], [values[i] for i in read])
         self.fill(self._output_places, other_results)
-        if adjoint.upload(start, dt, self.tables.given):
+        if adjoint.upload(start, dt):
             self._graphs.clear()
         self._graphs.replay("clean", self._clean)
         s, parts = self.integrator._solved(dt), list(self._parts)

@@ -61,24 +61,22 @@ def block_functions(nb: int, linear):
 
 
 @cache
-def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None, stored=None):
+def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None):
     """Build the kernel of assembly.
 
     `assemble`: write the blocks of H of every rod that has not converged.
 
-    From iteration `exact_from` on, H includes the geometric stiffness of rods that are not flagged `drop_compression`. `stored`:
-    precision of the stored blocks, if it differs. Launched over (tiles of `TILE` rods, nodes, rods of a tile), so that data of
-    three nodes is still cached.
+    From iteration `exact_from` on, H includes the geometric stiffness of rods that are not flagged `drop_compression`. Launched over
+    (tiles of `TILE` rods, nodes, rods of a tile), so that data of three nodes is still cached.
     """
     dim, nb, nb2, twist, span, closed = kind.dim, kind.block, kind.block**2, kind.twist, kind.span, kind.closed
     window, vertex_rows, edge_rows, tensions = kind.window, kind.vertex_strains, kind.edge_strains, kind.tensions
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     drag, Inertia = kind.drag, inertia_type(kind, real)
     edge_row, tension_row = vertex_rows * window, vertex_rows * window + edge_rows * dim
-    stored = stored or linear
     previous, _ = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
-    rests = converged_function(real)
+    rests, (_, store, *_) = converged_function(real), block_functions(nb, linear)
     curved, begin = exact_from is not None, exact_from or 0
     first_first, first_mid, first_last, mid_mid, mid_last, last_last = geometric_stiffness.block_functions(kind, linear)
 
@@ -116,12 +114,6 @@ def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None, 
         return m
 
     @wp.func
-    def store(A: wp.array3d(dtype=stored), row: int, k: int, r: int, m: M):
-        for i in range(wp.static(nb)):
-            for j in range(wp.static(nb)):
-                A[row + i * wp.static(nb) + j, k, r] = stored(m[i, j])
-
-    @wp.func
     def free_of(fixed: wp.array2d(dtype=wp.uint8), k: int, r: int):
         free = H()
         for d in range(wp.static(nb)):
@@ -139,7 +131,7 @@ def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None, 
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         reuse: int,
-        blocks_out: wp.array3d(dtype=stored),
+        blocks_out: wp.array3d(dtype=linear),
     ):
         tile, k, lane = wp.tid()
         r = tile * TILE + lane

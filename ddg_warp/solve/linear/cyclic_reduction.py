@@ -68,14 +68,13 @@ class CyclicReduction:
             return [*reducing, self._pack, (self._again, self._threads)]
         return [*reducing, (self._last, 32), self._expand]
 
-    def solve(self, matrix, rhs, count, wanted, solution: wp.array, lost: wp.array, again: bool = False) -> None:
+    def solve(self, matrix, rhs, count, wanted, solution: wp.array, lost: wp.array) -> None:
         """Solve the wanted columns from the blocks of nodes; count lost pivots in `lost`.
 
-        `again` solves a further right-hand side of the same matrix. The solution may overwrite the right-hand side.
+        The solution may overwrite the right-hand side.
         """
         if self.repeats:
-            if not again:
-                self.factorise(matrix, count, wanted, lost)
+            self.factorise(matrix, count, wanted, lost)
             self.again(rhs, count, wanted, 1, solution)
             return
         for level, kernel in enumerate(self._reduce):
@@ -178,15 +177,13 @@ class Elimination:
         """Kernels to load before a capture."""
         return [(kernel, THREADS) for kernel in ([self._solve] if self._solve else [self._factor, self._direct])]
 
-    def solve(self, matrix, rhs, count, wanted, solution: wp.array, lost: wp.array, again: bool = False) -> None:
+    def solve(self, matrix, rhs, count, wanted, solution: wp.array, lost: wp.array) -> None:
         """Solve the wanted columns; see `CyclicReduction.solve`."""
         if self._solve:
             self._launch(self._solve, [matrix, rhs, count, wanted], [self._factors, solution, lost])
             return
-        if not again:
-            self._launch(
-                self._factor, [matrix, count, wanted, self._iteration, int(self._reuse)], [self._factors, lost]
-            )
+        inputs = [matrix, count, wanted, self._iteration, int(self._reuse)]
+        self._launch(self._factor, inputs, [self._factors, lost])
         self._launch(self._direct, [self._factors, rhs, count, wanted], [solution])
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:

@@ -15,7 +15,6 @@ class AssembledNewton(RodNewton):
     """Newton's method with the matrix of every node in memory; see `RodNewton` and `kernels.linear.rod_matrix`.
 
     Args:
-        stored: scalar type of the blocks, if it differs from the elements'.
         ranges: ranges of nodes by which a rod is summed; see `kernels.newton.line_search`.
 
     Attributes:
@@ -30,15 +29,14 @@ class AssembledNewton(RodNewton):
         linear=None,
         midpoint: bool = False,
         mixed_axial: bool = False,
-        stored=None,
         ranges: int = 1,
     ):
         super().__init__(model, group, options, linear, midpoint, mixed_axial)
-        kind, self.stored, self.ranges = group.kind, stored or self.linear, ranges
+        kind, self.ranges = group.kind, ranges
         self.blocks = self.vectors(3 * kind.block**2)
         self.islands.edges_rotated.fill_(1)  # `base` is the start of every step
         self.partial = device_arrays.allocate((4, ranges, group.columns), self.real, self.device)
-        self._assemble = rod_matrix.assemble_kernel(kind, self.real, self.linear, self.exact_from, self.stored)
+        self._assemble = rod_matrix.assemble_kernel(kind, self.real, self.linear, self.exact_from)
         self._weigh, self._gauge = line_search.sum_kernels(kind, self.real, self.linear)
         self._decide_action, self._take = line_search.decide_kernels(kind, self.real, self.exact, self.psd == "none")
 
@@ -58,7 +56,7 @@ class AssembledNewton(RodNewton):
     def vectors(self, rows: int | None = None) -> wp.array:
         """Return zeros of the linear algebra for every node, by default as many as its dofs."""
         group = self.group
-        return device_arrays.allocate((rows or group.kind.block, group.nodes, group.columns), self.stored, self.device)
+        return device_arrays.allocate((rows or group.kind.block, group.nodes, group.columns), self.linear, self.device)
 
     def sweep(self) -> None:
         """Assemble, decide, solve for a direction and take it."""
