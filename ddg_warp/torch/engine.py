@@ -16,7 +16,7 @@ from ddg_warp.adjoint.implicit import Adjoint, EquilibriumAdjoint
 from ddg_warp.adjoint.rod_predictor import RodPredictor
 from ddg_warp.adjoint.rod_step import SavedStep
 from ddg_warp.capture_lock import alone
-from ddg_warp.kernels.adjoint.time_step import flag_kernels, requested_kernel, smooth_kernel
+from ddg_warp.kernels.adjoint.time_step import flag_kernels, requested_kernels, smooth_kernel
 from ddg_warp.model.controls import Controls
 from ddg_warp.model.rebuild import ModelBuilder
 from ddg_warp.model.state import Sliding
@@ -189,27 +189,25 @@ class Engine:
     ) -> tuple[list[torch.Tensor], list, list[torch.Tensor]]:
         """Return the gradients of a step by start state and other inputs, and flags (islands,).
 
-        Gradients are to be multiplied by the flags, which are NaN where an island has no gradient but a nonzero cotangent. Failed
-        worlds are treated as at rest, so that they contribute no NaN without a cotangent.
+        Flags are NaN where an island has no gradient but a nonzero cotangent, and so are its gradients by the start state; others are
+        to be multiplied by the flags. Failed worlds are treated as at rest, so that they contribute no NaN without a cotangent.
 
         Args:
             start, dt: time and length of the step.
             before, after: tensors of the states before and after the step.
             other_results: further results of `forward`, after the state.
-            cotangent: tensors of the gradient with respect to the state after the step.
+            cotangent: tensors of the gradient with respect to the state after the step, None for zero.
             controls: controls of the step.
         """
         adjoint = self._adjoint()
         self.controls.give_field(controls)
         self.controls.give_gravity(controls, adjoint)
-        for targets, values, read in zip(
-            (self.source, self.target, self._by_state), (before, after, cotangent), self._read, strict=True
-        ):
-            self.fill([targets[i] for i in read], [values[i] for i in read])
-        self.fill(self._output_places, other_results)
+        self._fill_all((before, after, cotangent), other_results)
         if adjoint.upload(start, dt):
             self._graphs.clear()
-        self._graphs.replay("clean", self._clean)
+        between = self.midpoint or adjoint.coupled is not None  # then solutions are formed of cleaned states
+        if between:
+            self._graphs.replay("clean", self._clean)
         s, parts = self.integrator._solved(dt), list(self._parts)
         for kept, end in zip(parts if self.midpoint else (), self.after.groups, strict=False):
             for middle, *ends in ((kept.x, end.x, kept.before.x), (kept.theta, end.theta, kept.before.theta)):
@@ -218,6 +216,8 @@ class Engine:
             parts.append(self._net_kept(start, dt))
 
         def launch():
+            if not between:
+                self._clean()
             self._found = adjoint.vjp_of_parts(self.before, self.after, parts, self._given, s)
             self._judge()
 
@@ -233,6 +233,22 @@ class Engine:
         if self._by_start is None:  # whose memory stays
             self._by_start = tensors(by_start, self.fields)
         return self._by_start, inputs, self._flag_tensors
+
+    def _fill_all(self, states, other_results) -> None:
+        """Copy the tensors of a step and of the gradient by its end, with None for zero, and the results other than the state."""
+        count = self.parts
+        targets, values, empty = self._output_places[:count], list(other_results[:count]), []
+        for places, given, read in zip((self.source, self.target, self._by_state), states, self._read, strict=True):
+            for i in read:
+                if given[i] is None:
+                    empty.append(places[i])
+                else:
+                    targets.append(places[i])
+                    values.append(given[i])
+        self.fill(targets, values)  # of one type, in few launches
+        self.fill(self._output_places[count:], other_results[count:])
+        if empty:
+            torch._foreach_zero_(empty)
 
     def _clean(self) -> None:
         """Put failed worlds at rest before a backward pass; launches only."""
@@ -259,15 +275,25 @@ class Engine:
         wp.capture_if(lost, self._ask)
 
     def _ask(self) -> None:
-        """Reset to 1 the flags of islands with zero cotangent."""
-        cotangents = [part for name, part in self._given.parts().items() if name != "grips"]
-        for part, result_flags, requested in zip(cotangents, *self._flags[1:], strict=True):
-            for name, array in part.arrays().items():
-                if name.rstrip("_0123456789") in GRADIENTS and array.shape[-1] % len(result_flags) == 0:
-                    cube, kernel = cubed(array), requested_kernel(array.dtype, self.model.types.real)
-                    inputs = [result_flags, cube, cube.shape[-1] // len(result_flags)]
-                    wp.launch(kernel, cube.shape, inputs, [requested], device=array.device)
+        """Reset to 1 the flags of islands with zero cotangent; replace the gradients of others without a gradient by NaN."""
+        real, by_start = self.model.types.real, self._found[0]
+        for given, found, result_flags, requested in zip(
+            self._graded(self._given), self._graded(by_start), *self._flags[1:], strict=True
+        ):
+            for cube in _cubes(given, len(result_flags)):
+                asked, _ = requested_kernels(cube.dtype, real)
+                inputs = [result_flags, cube, cube.shape[-1] // len(result_flags)]
+                wp.launch(asked, cube.shape, inputs, [requested], device=cube.device)
             wp.launch(self._excuse, len(result_flags), [requested], [result_flags], device=result_flags.device)
+            for cube in _cubes(found, len(result_flags)):
+                _, spoil = requested_kernels(cube.dtype, real)
+                inputs = [result_flags, cube.shape[-1] // len(result_flags)]
+                wp.launch(spoil, cube.shape, inputs, [cube], device=cube.device)
+
+    @staticmethod
+    def _graded(state) -> list:
+        """Return the states of all subsystems, in the order of the flags."""
+        return [part for name, part in state.parts().items() if name != "grips"]
 
     def _adjoint(self) -> Adjoint:
         if self.adjoint is None:
@@ -322,7 +348,7 @@ class Engine:
     def _load(self) -> None:
         kernels = [kernel for adjoint in self.adjoint.parts for kernel in adjoint.kernels]
         types = {array.dtype for array in self._given.arrays().values()}
-        kernels += [requested_kernel(dtype, self.model.types.real) for dtype in types]
+        kernels += [kernel for dtype in types for kernel in requested_kernels(dtype, self.model.types.real)]
         kernels += [self._solves, self._excuse, self._fails]
         device_arrays.load_kernels(kernels, self.model.wp_device)
         self.integrator._worlds.load_modules()
@@ -457,6 +483,15 @@ class Engine:
     def extra_outputs(self) -> int:
         """Maximum number of tensors that `forward` returns besides the state."""
         return self.parts + 1 + len(self.solutions)
+
+
+def _cubes(part, islands: int) -> list[wp.array]:
+    """Return the arrays of a subsystem's state that have gradients, with three axes and columns of `islands` islands."""
+    return [
+        cubed(array)
+        for name, array in part.arrays().items()
+        if name.rstrip("_0123456789") in GRADIENTS and array.shape[-1] % islands == 0
+    ]
 
 
 def _on_host(controls: dict) -> Controls:

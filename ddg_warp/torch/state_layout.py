@@ -138,14 +138,13 @@ class StateLayout:
         return values
 
     def flagged(self, values: list[torch.Tensor], flags) -> list[torch.Tensor]:
-        """Multiply the gradient by the arrays of a state with flags, which are NaN where a step has no gradient."""
-        smooth = [(value, field) for value, field in zip(values, self.fields, strict=True) if field.smooth]
-        return list(torch._foreach_mul([value for value, _ in smooth], [self._flag(*pair, flags) for pair in smooth]))
-
-    def _flag(self, values: torch.Tensor, field: Field, flags) -> torch.Tensor:
-        """Return the flags of a subsystem's islands in the layout of an array."""
-        part = field.name.partition("/")[0]
-        return along(self.by_world(flags) if part == "grips" else flags[self._part(part)], field, values)
+        """Return copies of the gradients by the arrays of a state; grips' are NaN in worlds with a flag that is."""
+        results = copies([value for value, field in zip(values, self.fields, strict=True) if field.smooth])
+        smooth = [field for field in self.fields if field.smooth]
+        for value, field in zip(results, smooth, strict=True) if self.model.grips else ():
+            if field.name.startswith("grips/"):
+                value *= along(self.by_world(flags), field, value)
+        return results
 
     def by_world(self, flags) -> torch.Tensor:
         """Return 1 for worlds with a gradient in every island, else NaN."""
@@ -159,9 +158,6 @@ class StateLayout:
         if key not in self._places:
             self._places[key] = [torch.as_tensor(np.asarray(v), device=self.device) for v in find()]
         return self._places[key]
-
-    def _part(self, name: str) -> int:
-        return len(self.model.groups) if name == "net" else int(name)
 
     def _of(self, name: str) -> int | None:
         return next((i for i, field in enumerate(self.fields) if field.name == name), None)

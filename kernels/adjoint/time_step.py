@@ -380,10 +380,11 @@ def flag_kernels(real):
 
 
 @cache
-def requested_kernel(dtype, real):
-    """Build the kernel that finds non-zero cotangents.
+def requested_kernels(dtype, real):
+    """Build the kernels of islands with NaN flags; each has `per_island` columns.
 
-    `asked`: mark islands with NaN flags that have a non-zero cotangent; each has `per_island` columns.
+    `asked`: mark islands with a non-zero cotangent.
+    `spoil`: replace their gradients by NaN.
     """
     several = hasattr(dtype, "_wp_scalar_type_")
 
@@ -404,4 +405,10 @@ def requested_kernel(dtype, real):
                 if value != real(0.0):
                     has_cotangent_out[k / per_island] = 1
 
-    return asked
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def spoil(flags: wp.array(dtype=real), per_island: int, gradient: wp.array3d(dtype=dtype)):
+        i, j, k = wp.tid()
+        if wp.isnan(flags[k / per_island]):
+            gradient[i, j, k] = dtype(real(wp.nan))
+
+    return asked, spoil
