@@ -235,16 +235,18 @@ class Engine:
         return self._by_start, inputs, self._flag_tensors
 
     def _fill_all(self, states, other_results) -> None:
-        """Copy the tensors of a step and of the gradient by its end, with None for zero, and the results other than the state."""
+        """Copy the tensors of a step, of the gradient by the end (None for zero), and of the results other than the state."""
         count = self.parts
         targets, values, empty = self._output_places[:count], list(other_results[:count]), []
-        for places, given, read in zip((self.source, self.target, self._by_state), states, self._read, strict=True):
+        for places, tensors_of, read in zip(
+            (self.source, self.target, self._by_state), states, self._read, strict=True
+        ):
             for i in read:
-                if given[i] is None:
+                if tensors_of[i] is None:
                     empty.append(places[i])
                 else:
                     targets.append(places[i])
-                    values.append(given[i])
+                    values.append(tensors_of[i])
         self.fill(targets, values)  # of one type, in few launches
         self.fill(self._output_places[count:], other_results[count:])
         if empty:
@@ -277,15 +279,15 @@ class Engine:
     def _ask(self) -> None:
         """Reset to 1 the flags of islands with zero cotangent; replace the gradients of others without a gradient by NaN."""
         real, by_start = self.model.types.real, self._found[0]
-        for given, found, result_flags, requested in zip(
+        for cotangent, gradient, result_flags, requested in zip(
             self._graded(self._given), self._graded(by_start), *self._flags[1:], strict=True
         ):
-            for cube in _cubes(given, len(result_flags)):
+            for cube in _cubes(cotangent, len(result_flags)):
                 asked, _ = requested_kernels(cube.dtype, real)
                 inputs = [result_flags, cube, cube.shape[-1] // len(result_flags)]
                 wp.launch(asked, cube.shape, inputs, [requested], device=cube.device)
             wp.launch(self._excuse, len(result_flags), [requested], [result_flags], device=result_flags.device)
-            for cube in _cubes(found, len(result_flags)):
+            for cube in _cubes(gradient, len(result_flags)):
                 _, spoil = requested_kernels(cube.dtype, real)
                 inputs = [result_flags, cube.shape[-1] // len(result_flags)]
                 wp.launch(spoil, cube.shape, inputs, [cube], device=cube.device)

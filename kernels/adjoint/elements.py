@@ -22,10 +22,10 @@ def _write_lagged_function(storage: ElementStorage, index: int, real, adds: bool
     @wp.func
     def write_lagged(out: wp.array2d(dtype=real), f: S, column: int):
         for i in range(wp.static(rows)):
+            value = f[i]
             if wp.static(adds):
-                out[i, column] = out[i, column] + f[i]
-            else:
-                out[i, column] = f[i]
+                value += out[i, column]
+            out[i, column] = value
 
     return write_lagged
 
@@ -92,15 +92,18 @@ def _pull_function(storage: ElementStorage, index: int, real, adds: bool, measur
             dmeasure += parameter_out[wp.static(row), column]
         parameter_out[wp.static(row), column] = dmeasure
         for m in range(wp.static(rows)):
+            by_parameter = dp[m]
             if wp.static(adds):
-                dp[m] += parameter_out[wp.static(row + 1) + m, column]
-            parameter_out[wp.static(row + 1) + m, column] = dp[m]
+                by_parameter += parameter_out[wp.static(row + 1) + m, column]
+            parameter_out[wp.static(row + 1) + m, column] = by_parameter
         if wp.static(lagged):
             for m in range(wp.static(n)):
+                by_strain = dp[wp.static(rows) + m]
                 if wp.static(adds):
-                    dp[wp.static(rows) + m] += last_out[wp.static(strain) + m, column]
-                last_out[wp.static(strain) + m, column] = dp[wp.static(rows) + m]
-            rate_out[column] = rate_out[column] + dp[wp.static(size - 1)]
+                    by_strain += last_out[wp.static(strain) + m, column]
+                last_out[wp.static(strain) + m, column] = by_strain
+            by_rate = rate_out[column] + dp[wp.static(size - 1)]
+            rate_out[column] = by_rate
         return spread(dq)
 
     return pull

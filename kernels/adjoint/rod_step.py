@@ -73,9 +73,9 @@ def rod_step_kernels(kind: RodKind, real, midpoint: bool, complete: bool):
                     frame_out[3 + d, k, r] = dt[d]
             b = _previous(k, n)
             if b >= 0:
-                behind, _du, _dt = frame_vjp(x, frame, by_frame, b, n, r)
+                edge_before, _du, _dt = frame_vjp(x, frame, by_frame, b, n, r)
                 for d in range(3):
-                    more[d] = more[d] + behind[d]
+                    more[d] = more[d] + edge_before[d]
         if wp.static(midpoint):
             store_row(more_out, k, r, more)
         total = solution_of(cotangent, more, masses(mass, rotary, k, r), resisted, n, rate[r], k, r)
