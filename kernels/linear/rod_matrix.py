@@ -61,24 +61,16 @@ def block_functions(nb: int, linear):
 
 
 @cache
-def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None):
-    """Build the kernel of assembly.
+def element_functions(kind: RodKind, linear):
+    """Return the device functions `factor_row` and `edge_block` of Gauss-Newton factors F.
 
-    `assemble`: write the blocks of H of every rod that has not converged.
-
-    From iteration `exact_from` on, H includes the geometric stiffness of rods that are not flagged `drop_compression`. Launched over
-    (tiles of `TILE` rods, nodes, rods of a tile), so that data of three nodes is still cached.
+    `factor_row(F, row, k, r, local_node)`: a row at the first (0), second (1) or third (2) node of the vertex that starts at node k.
+    `edge_block(F, k, r)`: block of the edge that starts at node k, at both of its nodes.
     """
-    dim, nb, nb2, twist, span, closed = kind.dim, kind.block, kind.block**2, kind.twist, kind.span, kind.closed
+    dim, nb, twist = kind.dim, kind.block, kind.twist
     window, vertex_rows, edge_rows, tensions = kind.window, kind.vertex_strains, kind.edge_strains, kind.tensions
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
-    drag, Inertia = kind.drag, inertia_type(kind, real)
     edge_row, tension_row = vertex_rows * window, vertex_rows * window + edge_rows * dim
-    previous, _ = node_functions(kind, real)
-    along, *_ = gather_functions(kind, real)
-    rests, (_, store, *_) = converged_function(real), block_functions(nb, linear)
-    curved, begin = exact_from is not None, exact_from or 0
-    first_first, first_mid, first_last, mid_mid, mid_last, last_last = geometric_stiffness.block_functions(kind, linear)
 
     @wp.func
     def part(F: wp.array3d(dtype=linear), row: int, k: int, r: int):
@@ -88,8 +80,7 @@ def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None):
         return v
 
     @wp.func
-    def own(F: wp.array3d(dtype=linear), row: int, k: int, r: int, local_node: int):
-        """Return the factor row at the first (0), second (1) or third (2) node of the vertex."""
+    def factor_row(F: wp.array3d(dtype=linear), row: int, k: int, r: int, local_node: int):
         v = H()
         if local_node == 0:
             v = -part(F, row, k, r)
@@ -112,6 +103,29 @@ def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None):
             for d in range(wp.static(dim)):
                 m[d, d] = m[d, d] + F[wp.static(tension_row) + i, k, r]
         return m
+
+    return factor_row, edge_block
+
+
+@cache
+def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None):
+    """Build the kernel of assembly.
+
+    `assemble`: write the blocks of H of every rod that has not converged.
+
+    From iteration `exact_from` on, H includes the geometric stiffness of rods that are not flagged `drop_compression`. Launched over
+    (tiles of `TILE` rods, nodes, rods of a tile), so that data of three nodes is still cached.
+    """
+    dim, nb, nb2, twist, span, closed = kind.dim, kind.block, kind.block**2, kind.twist, kind.span, kind.closed
+    window, vertex_rows = kind.window, kind.vertex_strains
+    H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
+    drag, Inertia = kind.drag, inertia_type(kind, real)
+    factor_row, edge_block = element_functions(kind, linear)
+    previous, _ = node_functions(kind, real)
+    along, *_ = gather_functions(kind, real)
+    rests, (_, store, *_) = converged_function(real), block_functions(nb, linear)
+    curved, begin = exact_from is not None, exact_from or 0
+    first_first, first_mid, first_last, mid_mid, mid_last, last_last = geometric_stiffness.block_functions(kind, linear)
 
     @wp.func
     def free_of(fixed: wp.array2d(dtype=wp.uint8), k: int, r: int):
@@ -157,16 +171,16 @@ def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None):
             for m in range(wp.static(vertex_rows)):
                 row = m * wp.static(window)
                 if wp.static(closed) or k < n - 2:
-                    A = own(F, row, k, r, 0)
+                    A = factor_row(F, row, k, r, 0)
                     D += wp.outer(A, A)
-                    E += wp.outer(A, own(F, row, k, r, 1))
-                    G += wp.outer(A, own(F, row, k, r, 2))
+                    E += wp.outer(A, factor_row(F, row, k, r, 1))
+                    G += wp.outer(A, factor_row(F, row, k, r, 2))
                 if b >= 0 and (wp.static(closed) or k < n - 1):
-                    B = own(F, row, b, r, 1)
+                    B = factor_row(F, row, b, r, 1)
                     D += wp.outer(B, B)
-                    E += wp.outer(B, own(F, row, b, r, 2))
+                    E += wp.outer(B, factor_row(F, row, b, r, 2))
                 if bb >= 0:
-                    C = own(F, row, bb, r, 2)
+                    C = factor_row(F, row, bb, r, 2)
                     D += wp.outer(C, C)
             if wp.static(curved):
                 if flags[DROP_COMPRESSION, r] == 0 and flags[ITERATION, r] >= wp.static(begin):
@@ -267,71 +281,6 @@ def factor_function(nb: int, span: int, linear, tensions: int = 0):
         return lost
 
     return factorise
-
-
-@cache
-def solve_function(nb: int, span: int, linear):
-    """Return the device function `solve(blocks, v, factor, out, n, r) -> lost pivots`: out = H^-1 v along an open rod of n nodes.
-
-    For one right-hand side, of which each node is read before it is written. `factor` is scratch, 2 nb^2 rows of every node.
-    """
-    nb2 = nb**2
-    H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
-    load, store, vector, store_vector = block_functions(nb, linear)
-    eliminate, lower, upper, lower_vector, upper_vector, congruence = block_ldlt.functions(nb, linear)
-
-    @wp.func
-    def solve(
-        blocks: wp.array3d(dtype=linear),
-        v: wp.array3d(dtype=linear),
-        factor: wp.array3d(dtype=linear),
-        out: wp.array3d(dtype=linear),
-        n: int,
-        r: int,
-    ):
-        lost = int(0)
-        # updates by the nodes before: of this node, of its coupling, and of the next node
-        minus = M()
-        minus_couple = M()
-        minus_next = M()
-        before = H()
-        before_next = H()
-        for j in range(n):
-            L, inverse, lost_here = eliminate(load(blocks, 0, j, r) - minus)
-            lost += lost_here
-            w = vector(v, 0, j, r) - before
-            store_vector(out, 0, j, r, upper_vector(L, inverse, lower_vector(L, w)))
-            B = M()
-            if j < n - 1:
-                B = load(blocks, wp.static(nb2), j, r) - minus_couple
-            Zb = lower(L, B)
-            U = upper(L, inverse, Zb)
-            store(factor, 0, j, r, U)
-            minus = minus_next + congruence(Zb, inverse, Zb)
-            before = before_next + w * U
-            if wp.static(span == 2):
-                C = M()
-                if j < n - 2:
-                    C = load(blocks, wp.static(2 * nb2), j, r)
-                Zc = lower(L, C)
-                V = upper(L, inverse, Zc)
-                store(factor, wp.static(nb2), j, r, V)
-                minus_couple = congruence(Zb, inverse, Zc)
-                minus_next = congruence(Zc, inverse, Zc)
-                before_next = w * V
-        e1 = H()
-        e2 = H()
-        for i in range(n):
-            j = n - 1 - i
-            u = vector(out, 0, j, r) - load(factor, 0, j, r) * e1
-            if wp.static(span == 2):
-                u -= load(factor, wp.static(nb2), j, r) * e2
-            store_vector(out, 0, j, r, u)
-            e2 = e1
-            e1 = u
-        return lost
-
-    return solve
 
 
 @cache
