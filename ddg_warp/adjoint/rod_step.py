@@ -222,7 +222,7 @@ class RodStepAdjoint:
                 self._launch(self._edges, [lag, group.count], [by_frame])
         end, out, began = map(group.node_state, (cotangent, start, before))
         masses = [group.mass, group.rotary, None]
-        read = [end, after.x, kept.frame, by_frame, window, group.fixed, *masses, group.count, self._rate]
+        read = [end, after.x, kept.frame, by_frame, window, group.fixed, self._leaves, *masses, group.count, self._rate]
         self._launch(self._end, read, [lagged, cotangents.end, by_solution, cotangents.rhs])
         resisted = self.drag and (self.drag, before, tangents)
         self.solve(kept, before.last, s, cotangents.rhs, inputs.load, resisted)

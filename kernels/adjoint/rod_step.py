@@ -20,7 +20,7 @@ def rod_step_kernels(kind: RodKind, real, midpoint: bool, complete: bool):
     """Build the kernels before and after the adjoint solve.
 
     `end`: write gradients by the dofs of the solve and by its lagged frames, given gradients by the end of the step, and the right-hand
-    side of the adjoint solve.
+    side of the adjoint solve. If `complete`, gradients by dofs are of nodes with dofs that stay at the start alone.
     `start`: write gradients by the start of the step and the inputs of inertia, given the adjoint w of the solve. Add the element
     contributions to gradients by dofs and frames. If `complete`, include the end update; else see `time_step.step_kernels`.
     """
@@ -38,6 +38,11 @@ def rod_step_kernels(kind: RodKind, real, midpoint: bool, complete: bool):
     def has_edge(k: int, n: int):
         return wp.static(closed) or k < n - 1
 
+    @wp.func
+    def stays(leaves: wp.array2d(dtype=wp.uint8), k: int, r: int):
+        """Return True if gradients by the dofs of a node are needed: not if all leave the start."""
+        return wp.static(not complete) or leaves[k, r] != wp.uint8(255)
+
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def end(
         cotangent: State,
@@ -46,6 +51,7 @@ def rod_step_kernels(kind: RodKind, real, midpoint: bool, complete: bool):
         by_frame: wp.array3d(dtype=real),
         window: wp.array3d(dtype=real),
         fixed: wp.array2d(dtype=wp.uint8),
+        leaves: wp.array2d(dtype=wp.uint8),
         mass: wp.array2d(dtype=real),
         rotary: wp.array2d(dtype=real),
         resisted: wp.array2d(dtype=Inertia),
@@ -79,7 +85,8 @@ def rod_step_kernels(kind: RodKind, real, midpoint: bool, complete: bool):
         if wp.static(midpoint):
             store_row(more_out, k, r, more)
         total = solution_of(cotangent, more, masses(mass, rotary, k, r), resisted, n, rate[r], k, r)
-        store_row(dof_out, k, r, total)
+        if stays(leaves, k, r):
+            store_row(dof_out, k, r, total)
         store_row(right_out, k, r, free_components(int(fixed[k, r]), total))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -121,8 +128,10 @@ def rod_step_kernels(kind: RodKind, real, midpoint: bool, complete: bool):
         )
         if wp.static(viscous):
             by_rate += rate_out[k, r]
-        by_dofs = row_of(dof_out, k, r) + gathered(window, k, n, r)
-        store_row(dof_out, k, r, by_dofs)
+        by_dofs = B()
+        if stays(leaves, k, r):
+            by_dofs = row_of(dof_out, k, r) + gathered(window, k, n, r)
+            store_row(dof_out, k, r, by_dofs)
         if wp.static(twist):
             if has_edge(k, n):
                 add_lagged(lag, frame_out, k, n, r)
