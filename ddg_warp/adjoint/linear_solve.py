@@ -10,13 +10,12 @@ from scipy.sparse.linalg import splu
 
 from ddg_warp import device_arrays
 from ddg_warp.errors import SolverError
-from ddg_warp.kernels.adjoint import rod_solve
 from ddg_warp.solve.equilibrium.rigid_modes import rigid_modes
 from ddg_warp.solve.equilibrium.rod_tangent import RodTangent
-from ddg_warp.solve.linear.cyclic_reduction import THREADS, CyclicReduction, Elimination
+from ddg_warp.solve.linear.cyclic_reduction import CyclicReduction, Elimination
 from ddg_warp.solve.linear.solver_selection import automatic
 from ddg_warp.solve.linear.sparse_direct import SingularError, regular
-from ddg_warp.solve.newton.rod_newton import NewtonOptions, RodNewton
+from ddg_warp.solve.newton.rod_newton import NewtonOptions
 from ddg_warp.solve.newton.rod_newton_assembled import AssembledNewton
 
 SINGULAR = 1e-6  # Accepted relative residual; a singular matrix that was regularised leaves more
@@ -159,21 +158,15 @@ def _transposed(matrix: sparse.csc_matrix):
     return lambda rhs: factors.solve(rhs, trans="T")
 
 
-class ElementMatrices(RodNewton):
-    """Factors and geometric stiffnesses of elements, without memory of the sweep."""
-
-    def _prepare_sweep(self, mixed_axial: bool) -> None:
-        """Do nothing: a kernel of its own solves."""
-
-
 class DirectSolve:
-    """Device solver of H w = g of a rod group: block LDL^T from element matrices, one thread a rod.
+    """Device solver of H w = g of a rod group, by assembled blocks and their elimination or cyclic reduction.
 
-    Closed rods and few long ones are assembled in blocks, for elimination or cyclic reduction.
+    Measured (H100, 100,000 rods of 24 nodes): the reverse pass took 8.3 ms by the sweep of Newton's method, which keeps 2 kB a thread in
+    local memory in float64 with second derivatives; 7.5 ms by float32 factors, whose error took two refined solutions; 6.4 ms by
+    float64 blocks.
 
-    Measured (H100, 100,000 rods of 24 nodes, where float32 factors needed two solutions with refinement): all of the reverse pass
-    took 7.5 ms with these, 6.4 ms in float64. The sweep of Newton's method with second derivatives keeps 2 kB a thread in local memory
-    in float64: 8.4 ms.
+    Alternative: blocks formed in registers, without assembly. The kernel spills 0.7 kB a thread: as long for 100,000 rods, twice as
+    long for 2,560.
 
     Attributes:
         failed: nonzero for rods with an H that is not positive definite (columns,), where w is meaningless.
@@ -181,23 +174,18 @@ class DirectSolve:
 
     def __init__(self, model, group):
         kind, device, real, size = group.kind, model.wp_device, model.types.real, (group.nodes, group.columns)
-        arguments, few = (model, group, NewtonOptions(psd="none"), real), automatic(group) == "cyclic_reduction"
-        self.group, self.solver = group, None
-        if few or kind.closed:
-            self.system, self._wanted = AssembledNewton(*arguments), wp.full(group.columns, 1, dtype=int, device=device)
-            self.solver = (
-                CyclicReduction(kind.block, *size, real, device) if few else Elimination(kind, *size, real, device)
-            )
+        self._count, self._wanted = group.count, wp.full(group.columns, 1, dtype=int, device=device)
+        self.system = AssembledNewton(model, group, NewtonOptions(psd="none"), real)
+        if automatic(group) == "cyclic_reduction":
+            self.solver = CyclicReduction(kind.block, *size, real, device)
         else:
-            self.system, self._solve = ElementMatrices(*arguments), rod_solve.solve_kernel(kind, real)
-            self._eliminated = device_arrays.allocate((rod_solve.scratch_rows(kind), *size), real, device)
+            self.solver = Elimination(kind, *size, real, device, once=True)
         self.failed = self.system.islands.lost_pivots
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        solving = [self.system._assemble, *self.solver.kernels] if self.solver else [(self._solve, THREADS)]
-        return [(self.system._evaluate, 128), *solving]
+        return [(self.system._evaluate, 128), self.system._assemble, *self.solver.kernels]
 
     def __call__(self, solved, last: wp.array, rate: float, coefficient: float, rhs: wp.array, w: wp.array, resisted):
         """Write w; launches only. Arguments as of `RodLinearSolve`, `coefficient` that of inertia [1/s^2]."""
@@ -212,15 +200,8 @@ class DirectSolve:
             adjoint, *states = resisted
             adjoint.drag.resist(*states, loading.mass, loading.rotary, system.iterates.target_angle, islands)
         system.evaluate(last)
-        group = self.group
-        if self.solver:
-            system.assemble_blocks()
-            self.solver.solve(system.blocks, rhs, group.count, self._wanted, w, self.failed)
-            return
-        inputs = [system.elements.factor, system.elements.geometric, loading.mass, loading.rotary]
-        inputs += [islands.inertia_coefficient, group.fixed, rhs, group.count]
-        outputs = [self._eliminated, w, self.failed]
-        wp.launch(self._solve, group.columns, inputs, outputs, device=system.device, block_dim=THREADS)
+        system.assemble_blocks()
+        self.solver.solve(system.blocks, rhs, self._count, self._wanted, w, self.failed)
 
 
 class RodLinearSolve:

@@ -9,8 +9,10 @@ from ddg_warp.kernels.elements.rod_layout import RodKind
 from ddg_warp.kernels.linear import closed_rod, rod_matrix
 
 
-def kept_rows(kind: RodKind) -> int:
-    """Return the rows of factors of a node."""
+def kept_rows(kind: RodKind, once: bool = False) -> int:
+    """Return the rows of factors of a node; `once`: see `solve_kernel`."""
+    if once:
+        return 2 * kind.block**2
     return closed_rod.kept_rows(kind.block, kind.span) if kind.closed else 3 * kind.block**2 + kind.block
 
 
@@ -55,3 +57,25 @@ def elimination_kernels(kind: RodKind, linear):
             substitute(factor, rhs, solution, count[r], r, r)
 
     return factorise, direct
+
+
+@cache
+def solve_kernel(kind: RodKind, linear):
+    """Build the kernel of a factorisation with one right-hand side, of every wanted open rod."""
+    eliminate = rod_matrix.solve_function(kind.block, kind.span, linear)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def solve(
+        blocks: wp.array3d(dtype=linear),
+        rhs: wp.array3d(dtype=linear),
+        count: wp.array(dtype=int),
+        wanted: wp.array(dtype=int),
+        factor: wp.array3d(dtype=linear),
+        solution: wp.array3d(dtype=linear),
+        lost: wp.array(dtype=int),
+    ):
+        r = wp.tid()
+        if wanted[r] != 0:
+            lost[r] = lost[r] + eliminate(blocks, rhs, factor, solution, count[r], r)
+
+    return solve

@@ -13,7 +13,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.core.islands import DROP_COMPRESSION, INERTIA_COEFFICIENT, ITERATION, STATUS
-from ddg_warp.kernels.core.launch import CPU_OPTIONS
+from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
 from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions, inertia_type
 from ddg_warp.kernels.linear import block_ldlt, geometric_stiffness
 from ddg_warp.kernels.newton.line_search import converged_function
@@ -61,16 +61,24 @@ def block_functions(nb: int, linear):
 
 
 @cache
-def element_functions(kind: RodKind, linear):
-    """Return the device functions `factor_row` and `edge_block` of Gauss-Newton factors F.
+def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None):
+    """Build the kernel of assembly.
 
-    `factor_row(F, row, k, r, local_node)`: a row at the first (0), second (1) or third (2) node of the vertex that starts at node k.
-    `edge_block(F, k, r)`: block of the edge that starts at node k, at both of its nodes.
+    `assemble`: write the blocks of H of every rod that has not converged.
+
+    From iteration `exact_from` on, H includes the geometric stiffness of rods that are not flagged `drop_compression`. Launched over
+    (tiles of `TILE` rods, nodes, rods of a tile), so that data of three nodes is still cached.
     """
-    dim, nb, twist = kind.dim, kind.block, kind.twist
+    dim, nb, nb2, twist, span, closed = kind.dim, kind.block, kind.block**2, kind.twist, kind.span, kind.closed
     window, vertex_rows, edge_rows, tensions = kind.window, kind.vertex_strains, kind.edge_strains, kind.tensions
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
+    drag, Inertia = kind.drag, inertia_type(kind, real)
     edge_row, tension_row = vertex_rows * window, vertex_rows * window + edge_rows * dim
+    previous, _ = node_functions(kind, real)
+    along, *_ = gather_functions(kind, real)
+    rests, until, (_, store, *_) = converged_function(real), until_function(kind.serial), block_functions(nb, linear)
+    curved, begin = exact_from is not None, exact_from or 0
+    first_first, first_mid, first_last, mid_mid, mid_last, last_last = geometric_stiffness.block_functions(kind, linear)
 
     @wp.func
     def part(F: wp.array3d(dtype=linear), row: int, k: int, r: int):
@@ -80,7 +88,8 @@ def element_functions(kind: RodKind, linear):
         return v
 
     @wp.func
-    def factor_row(F: wp.array3d(dtype=linear), row: int, k: int, r: int, local_node: int):
+    def own(F: wp.array3d(dtype=linear), row: int, k: int, r: int, local_node: int):
+        """Return the factor row at the first (0), second (1) or third (2) node of the vertex."""
         v = H()
         if local_node == 0:
             v = -part(F, row, k, r)
@@ -104,29 +113,6 @@ def element_functions(kind: RodKind, linear):
                 m[d, d] = m[d, d] + F[wp.static(tension_row) + i, k, r]
         return m
 
-    return factor_row, edge_block
-
-
-@cache
-def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None):
-    """Build the kernel of assembly.
-
-    `assemble`: write the blocks of H of every rod that has not converged.
-
-    From iteration `exact_from` on, H includes the geometric stiffness of rods that are not flagged `drop_compression`. Launched over
-    (tiles of `TILE` rods, nodes, rods of a tile), so that data of three nodes is still cached.
-    """
-    dim, nb, nb2, twist, span, closed = kind.dim, kind.block, kind.block**2, kind.twist, kind.span, kind.closed
-    window, vertex_rows = kind.window, kind.vertex_strains
-    H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
-    drag, Inertia = kind.drag, inertia_type(kind, real)
-    factor_row, edge_block = element_functions(kind, linear)
-    previous, _ = node_functions(kind, real)
-    along, *_ = gather_functions(kind, real)
-    rests, (_, store, *_) = converged_function(real), block_functions(nb, linear)
-    curved, begin = exact_from is not None, exact_from or 0
-    first_first, first_mid, first_last, mid_mid, mid_last, last_last = geometric_stiffness.block_functions(kind, linear)
-
     @wp.func
     def free_of(fixed: wp.array2d(dtype=wp.uint8), k: int, r: int):
         free = H()
@@ -147,79 +133,82 @@ def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None):
         reuse: int,
         blocks_out: wp.array3d(dtype=linear),
     ):
-        tile, k, lane = wp.tid()
+        tile, first, lane = wp.tid()
         r = tile * TILE + lane
         if r >= count.shape[0]:
             return
         n = count[r]
-        if flags[STATUS, r] != 0 or k >= n:
+        if flags[STATUS, r] != 0 or first >= n:
             return
         if rests(flags, r):
             return
         if reuse != 0 and flags[ITERATION, r] > 0:
             return
         c = scalars[INERTIA_COEFFICIENT, r]
-        b = previous(k, n)
-        free = free_of(fixed, k, r)
-        D = M()
-        E = M()
-        G = M()
-        if wp.static(span == 2):
-            bb = int(-1)
-            if b >= 0:
-                bb = previous(b, n)
-            for m in range(wp.static(vertex_rows)):
-                row = m * wp.static(window)
-                if wp.static(closed) or k < n - 2:
-                    A = factor_row(F, row, k, r, 0)
-                    D += wp.outer(A, A)
-                    E += wp.outer(A, factor_row(F, row, k, r, 1))
-                    G += wp.outer(A, factor_row(F, row, k, r, 2))
-                if b >= 0 and (wp.static(closed) or k < n - 1):
-                    B = factor_row(F, row, b, r, 1)
-                    D += wp.outer(B, B)
-                    E += wp.outer(B, factor_row(F, row, b, r, 2))
-                if bb >= 0:
-                    C = factor_row(F, row, bb, r, 2)
-                    D += wp.outer(C, C)
-            if wp.static(curved):
-                if flags[DROP_COMPRESSION, r] == 0 and flags[ITERATION, r] >= wp.static(begin):
+        for k in range(first, until(first, n)):
+            b = previous(k, n)
+            free = free_of(fixed, k, r)
+            D = M()
+            E = M()
+            G = M()
+            if wp.static(span == 2):
+                bb = int(-1)
+                if b >= 0:
+                    bb = previous(b, n)
+                for m in range(wp.static(vertex_rows)):
+                    row = m * wp.static(window)
                     if wp.static(closed) or k < n - 2:
-                        D += first_first(second, k, r)
-                        E += first_mid(second, k, r)
-                        G += first_last(second, k, r)
+                        A = own(F, row, k, r, 0)
+                        D += wp.outer(A, A)
+                        E += wp.outer(A, own(F, row, k, r, 1))
+                        G += wp.outer(A, own(F, row, k, r, 2))
                     if b >= 0 and (wp.static(closed) or k < n - 1):
-                        D += mid_mid(second, b, r)
-                        E += mid_last(second, b, r)
+                        B = own(F, row, b, r, 1)
+                        D += wp.outer(B, B)
+                        E += wp.outer(B, own(F, row, b, r, 2))
                     if bb >= 0:
-                        D += last_last(second, bb, r)
-        if wp.static(closed) or k < n - 1:
-            S = edge_block(F, k, r)
-            D += S
-            E -= S
-        if b >= 0:
-            D += edge_block(F, b, r)
-        if wp.static(drag):
-            resistance = mass[k, r].resistance
-            for d in range(wp.static(dim)):
-                D[d, d] = D[d, d] + linear(c * mass[k, r].mass)
-                for i in range(wp.static(dim)):
-                    D[d, i] = D[d, i] + linear(resistance[d, i])
-        else:
-            for d in range(wp.static(dim)):
-                D[d, d] = D[d, d] + linear(c * mass[k, r])
-        if wp.static(twist):
-            D[wp.static(nb - 1), wp.static(nb - 1)] = D[wp.static(nb - 1), wp.static(nb - 1)] + linear(c * rotary[k, r])
-        D = wp.cw_mul(D, wp.outer(free, free)) + wp.diag(H(linear(1.0)) - free)
-        store(blocks_out, 0, k, r, D)
-        if wp.static(closed) or k < n - 1:
-            E = wp.cw_mul(E, wp.outer(free, free_of(fixed, along(k + 1, n), r)))
-        store(blocks_out, wp.static(nb2), k, r, E)
-        if wp.static(span == 2):
-            second_next = along(k + 2, n)
-            if wp.static(closed) or k < n - 2:
-                G = wp.cw_mul(G, wp.outer(free, free_of(fixed, second_next, r)))
-            store(blocks_out, wp.static(2 * nb2), k, r, G)
+                        C = own(F, row, bb, r, 2)
+                        D += wp.outer(C, C)
+                if wp.static(curved):
+                    if flags[DROP_COMPRESSION, r] == 0 and flags[ITERATION, r] >= wp.static(begin):
+                        if wp.static(closed) or k < n - 2:
+                            D += first_first(second, k, r)
+                            E += first_mid(second, k, r)
+                            G += first_last(second, k, r)
+                        if b >= 0 and (wp.static(closed) or k < n - 1):
+                            D += mid_mid(second, b, r)
+                            E += mid_last(second, b, r)
+                        if bb >= 0:
+                            D += last_last(second, bb, r)
+            if wp.static(closed) or k < n - 1:
+                S = edge_block(F, k, r)
+                D += S
+                E -= S
+            if b >= 0:
+                D += edge_block(F, b, r)
+            if wp.static(drag):
+                resistance = mass[k, r].resistance
+                for d in range(wp.static(dim)):
+                    D[d, d] = D[d, d] + linear(c * mass[k, r].mass)
+                    for i in range(wp.static(dim)):
+                        D[d, i] = D[d, i] + linear(resistance[d, i])
+            else:
+                for d in range(wp.static(dim)):
+                    D[d, d] = D[d, d] + linear(c * mass[k, r])
+            if wp.static(twist):
+                D[wp.static(nb - 1), wp.static(nb - 1)] = D[wp.static(nb - 1), wp.static(nb - 1)] + linear(
+                    c * rotary[k, r]
+                )
+            D = wp.cw_mul(D, wp.outer(free, free)) + wp.diag(H(linear(1.0)) - free)
+            store(blocks_out, 0, k, r, D)
+            if wp.static(closed) or k < n - 1:
+                E = wp.cw_mul(E, wp.outer(free, free_of(fixed, along(k + 1, n), r)))
+            store(blocks_out, wp.static(nb2), k, r, E)
+            if wp.static(span == 2):
+                second_next = along(k + 2, n)
+                if wp.static(closed) or k < n - 2:
+                    G = wp.cw_mul(G, wp.outer(free, free_of(fixed, second_next, r)))
+                store(blocks_out, wp.static(2 * nb2), k, r, G)
 
     return assemble
 
@@ -281,6 +270,71 @@ def factor_function(nb: int, span: int, linear, tensions: int = 0):
         return lost
 
     return factorise
+
+
+@cache
+def solve_function(nb: int, span: int, linear):
+    """Return the device function `solve(blocks, v, factor, out, n, r) -> lost pivots`: out = H^-1 v along an open rod of n nodes.
+
+    For one right-hand side, of which each node is read before it is written. `factor` is scratch, 2 nb^2 rows of every node.
+    """
+    nb2 = nb**2
+    H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
+    load, store, vector, store_vector = block_functions(nb, linear)
+    eliminate, lower, upper, lower_vector, upper_vector, congruence = block_ldlt.functions(nb, linear)
+
+    @wp.func
+    def solve(
+        blocks: wp.array3d(dtype=linear),
+        v: wp.array3d(dtype=linear),
+        factor: wp.array3d(dtype=linear),
+        out: wp.array3d(dtype=linear),
+        n: int,
+        r: int,
+    ):
+        lost = int(0)
+        # updates by the nodes before: of this node, of its coupling, and of the next node
+        minus = M()
+        minus_couple = M()
+        minus_next = M()
+        before = H()
+        before_next = H()
+        for j in range(n):
+            L, inverse, lost_here = eliminate(load(blocks, 0, j, r) - minus)
+            lost += lost_here
+            w = vector(v, 0, j, r) - before
+            store_vector(out, 0, j, r, upper_vector(L, inverse, lower_vector(L, w)))
+            B = M()
+            if j < n - 1:
+                B = load(blocks, wp.static(nb2), j, r) - minus_couple
+            Zb = lower(L, B)
+            U = upper(L, inverse, Zb)
+            store(factor, 0, j, r, U)
+            minus = minus_next + congruence(Zb, inverse, Zb)
+            before = before_next + w * U
+            if wp.static(span == 2):
+                C = M()
+                if j < n - 2:
+                    C = load(blocks, wp.static(2 * nb2), j, r)
+                Zc = lower(L, C)
+                V = upper(L, inverse, Zc)
+                store(factor, wp.static(nb2), j, r, V)
+                minus_couple = congruence(Zb, inverse, Zc)
+                minus_next = congruence(Zc, inverse, Zc)
+                before_next = w * V
+        e1 = H()
+        e2 = H()
+        for i in range(n):
+            j = n - 1 - i
+            u = vector(out, 0, j, r) - load(factor, 0, j, r) * e1
+            if wp.static(span == 2):
+                u -= load(factor, wp.static(nb2), j, r) * e2
+            store_vector(out, 0, j, r, u)
+            e2 = e1
+            e1 = u
+        return lost
+
+    return solve
 
 
 @cache

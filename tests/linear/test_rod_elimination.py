@@ -185,8 +185,9 @@ def test_direction_matches_dense_solve(device, name, closed):
     assert (device_arrays.download(newton.islands.lost_pivots_total) == 0).all()
 
 
+@pytest.mark.parametrize("once", [False, True])
 @EVERY_CHAIN
-def test_elimination_of_short_rods(device, name, closed):
+def test_elimination_of_short_rods(device, name, closed, once):
     """Rods of 3 to 9 nodes: solutions match dense matrices, and lost pivots are the negative eigenvalues of indefinite ones."""
     kind, counts, random = Problem(name, closed, device).kind, np.arange(3, 10), np.random.default_rng(3)
     nb, columns = kind.block, len(counts)
@@ -197,7 +198,7 @@ def test_elimination_of_short_rods(device, name, closed):
         diagonal += diagonal.swapaxes(0, 1) + (6.0 * nb if column % 2 else 1.0) * np.eye(nb)[..., None]
         dense.append(assembled(blocks[..., column], n, kind))
     rhs = random.normal(size=(nb, 9, columns))
-    solver = Elimination(kind, 9, columns, wp.float64, device)
+    solver = Elimination(kind, 9, columns, wp.float64, device, once=once)
     matrix, right, solution = (
         device_arrays.allocate((rows, 9, columns), wp.float64, device) for rows in (3 * nb**2, nb, nb)
     )

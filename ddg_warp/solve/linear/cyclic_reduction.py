@@ -158,11 +158,16 @@ class Elimination:
     Args:
         kind: `RodKind` of the rods; columns: number of rods in all worlds.
         iteration: iteration of every column, if factors of the first one are reused; else None.
+        once: True if each matrix has one right-hand side, which open rods solve for as they factorise.
     """
 
-    def __init__(self, kind, nodes: int, columns: int, linear, device, iteration: wp.array | None = None):
+    def __init__(
+        self, kind, nodes: int, columns: int, linear, device, iteration: wp.array | None = None, once: bool = False
+    ):
         self.columns, self.device = columns, device
-        self._factors = device_arrays.allocate((rod_elimination.kept_rows(kind), nodes, columns), linear, device)
+        once = once and not kind.closed
+        self._factors = device_arrays.allocate((rod_elimination.kept_rows(kind, once), nodes, columns), linear, device)
+        self._solve = rod_elimination.solve_kernel(kind, linear) if once else None
         self._reuse = iteration is not None
         self._iteration = iteration if self._reuse else wp.zeros(columns, dtype=int, device=device)
         self._factor, self._direct = rod_elimination.elimination_kernels(kind, linear)
@@ -170,10 +175,13 @@ class Elimination:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [(self._factor, THREADS), (self._direct, THREADS)]
+        return [(kernel, THREADS) for kernel in ([self._solve] if self._solve else [self._factor, self._direct])]
 
     def solve(self, matrix, rhs, count, wanted, solution: wp.array, lost: wp.array) -> None:
         """Solve the wanted columns; see `CyclicReduction.solve`."""
+        if self._solve:
+            self._launch(self._solve, [matrix, rhs, count, wanted], [self._factors, solution, lost])
+            return
         inputs = [matrix, count, wanted, self._iteration, int(self._reuse)]
         self._launch(self._factor, inputs, [self._factors, lost])
         self._launch(self._direct, [self._factors, rhs, count, wanted], [solution])

@@ -72,7 +72,7 @@ class AssembledNewton(RodNewton):
         group = self.group
         wp.launch(
             self._assemble,
-            (-(-group.columns // rod_matrix.TILE), group.nodes, min(rod_matrix.TILE, group.columns)),
+            (-(-group.columns // rod_matrix.TILE), group.node_threads[0], min(rod_matrix.TILE, group.columns)),
             [self.elements.factor, self.elements.geometric, group.count, self.loading.mass, self.loading.rotary]
             + [group.fixed, *self.islands.arrays, int(self.reuse)],
             [self.blocks],
