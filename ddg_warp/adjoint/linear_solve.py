@@ -161,12 +161,11 @@ def _transposed(matrix: sparse.csc_matrix):
 class DirectSolve:
     """Device solver of H w = g of a rod group, by assembled blocks and their elimination or cyclic reduction.
 
-    Measured (H100, 100,000 rods of 24 nodes): the reverse pass took 8.3 ms by the sweep of Newton's method, which keeps 2 kB a thread in
-    local memory in float64 with second derivatives; 7.5 ms by float32 factors, whose error took two refined solutions; 6.4 ms by
-    float64 blocks.
+    Measured (H100, 100,000 rods of 24 nodes): the reverse pass took 6.4 ms. By the sweep of Newton's method it took 8.3 ms, as
+    second derivatives in float64 keep 2 kB a thread in local memory. By float32 factors and two refined solutions it took 7.5 ms.
 
-    Alternative: blocks formed in registers, without assembly. The kernel spills 0.7 kB a thread: as long for 100,000 rods, twice as
-    long for 2,560.
+    Alternative: blocks formed in registers, without assembly. The kernel spills 0.7 kB a thread. It takes as long for 100,000 rods, and
+    twice as long for 2,560.
 
     Attributes:
         failed: nonzero for rods with an H that is not positive definite (columns,), where w is meaningless.

@@ -12,7 +12,7 @@ from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import motion_kernels
 from ddg_warp.kernels.collision.ccd.additive_ccd import impact_kernel
 from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, POINT_PLANE, POINT_TRIANGLE
-from ddg_warp.solve.collision.bvh import Aabbs, Primitives
+from ddg_warp.solve.collision.bvh import Primitives
 from ddg_warp.solve.collision.candidate_list import CandidateList
 from ddg_warp.solve.collision.candidate_validity import CandidateValidity, SearchCounters
 from ddg_warp.solve.collision.collision_mesh import BALLS, PLANES, CollisionMesh
@@ -87,6 +87,7 @@ class BroadPhase:
         self._never, self.every = (wp.full(worlds, flag, dtype=int, device=self.device) for flag in (0, 1))
         self.counters, self.validity = SearchCounters(self.device), CandidateValidity(shapes, x, self.margin)
         self._edges = primitives[2]
+        self._walked = [part for part in self._primitives if part.walked]
         *_, self._common = motion_kernels(real, device_arrays.serial(self.device))
         self.rebuild(x)
         sides = (EDGES, 2, 2), (POINT_TRIANGLE, 1, 3), (EDGE_POINT, 2, BALLS), (POINT_PLANE, 1, PLANES)
@@ -161,7 +162,9 @@ class BroadPhase:
         """
         move = self._still if move is None else move
         together = self._never if together is None else together
-        self._enclose(x, move, together, 1.0, self._within, Aabbs.renew)
+        self._enclose(x, move, together, 1.0, self._within)
+        for primitives in self._walked:
+            primitives.leaves.renew()
         inputs = x, move, together, self.search_distance, self._around
         device_arrays.side_by_side([partial(pairs.search, *inputs) for pairs in self.lists], self.device)
         self.validity.mark(x, move, together, self.counters)
@@ -322,7 +325,9 @@ class BroadPhase:
         return 0.5 * self.search_distance + self._around
 
     def _passing(self, kernels, x, move, min_separation_fraction: float, number, firsts) -> None:
-        self._enclose(x, move, self.every, min_separation_fraction, 0.0, lambda leaves: leaves.tree.refit())
+        self._enclose(x, move, self.every, min_separation_fraction, 0.0)
+        for primitives in self._walked:
+            primitives.leaves.tree.refit()
         for kernel, pairs, first in zip(kernels, self.lists, firsts, strict=True):
             pairs.impact(
                 kernel,
@@ -337,17 +342,11 @@ class BroadPhase:
         """Return the search distance, within which gaps close step by step; 0 if gaps may close."""
         return self.search_distance if min_separation_fraction > 0.0 else 0.0
 
-    def _enclose(self, x, move, together, radius_fraction: float, margin: float, renew=None) -> None:
-        """Write the AABBs of all primitives, and update their BVHs by `renew` of `Aabbs`."""
+    def _enclose(self, x, move, together, radius_fraction: float, margin: float) -> None:
         inputs = [self._edges.surface, self._edges.count, move, together]
         wp.launch(self._common, self.worlds, inputs, [self._shift], device=self.device)
-
-        def enclose(primitives: Primitives) -> None:
+        for primitives in self._primitives:
             primitives.enclose(x, move, self._shift, radius_fraction, margin, self.counters.lost)
-            if renew and primitives.walked:
-                renew(primitives.leaves)
-
-        device_arrays.side_by_side([partial(enclose, part) for part in self._primitives], self.device)
 
 
 def _check_fraction(min_separation_fraction: float) -> None:

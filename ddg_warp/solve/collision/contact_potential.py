@@ -177,8 +177,7 @@ class ContactPotential:
         law = self.lag_law
 
         def lag(part: ContactSet, friction: FrictionSet) -> None:
-            part.find(x, law, self._no_gap)
-            part.push(x, law)
+            part.write(x, law, self._no_gap)
             friction.lag(law, x, again, self.more)
 
         device_arrays.side_by_side(
@@ -218,14 +217,11 @@ class ContactPotential:
             for part in self.frictions:
                 part.evaluate(x, start, rate, iterates)
 
-        def evaluate_contact() -> None:
-            device_arrays.side_by_side([partial(part.push, x, self.law) for part in self.lists], self.device)
-            self._totals(self.search.counters.overflow, self._least, self.gap)
-
-        find = [partial(part.find, x, self.law, self._least) for part in self.lists]
-        device_arrays.side_by_side([*find, *([evaluate_friction] if self.frictions else [])], self.device)
-        device_arrays.side_by_side([evaluate_contact, *(part.list_pairs for part in self.lists)], self.device)
-        self.blocks.collect(self.products.sets, self.forces)
+        push = [partial(part.evaluate, x, self.law, self._least) for part in self.lists]
+        device_arrays.side_by_side([*push, *([evaluate_friction] if self.frictions else [])], self.device)
+        collect = partial(self.blocks.collect, self.products.sets, self.forces)
+        totals = partial(self._totals, self.search.counters.overflow, self._least, self.gap)
+        device_arrays.side_by_side([collect, totals], self.device)
 
     def _require_fit(self) -> None:
         """Refuse lists that have grown since `fit`."""

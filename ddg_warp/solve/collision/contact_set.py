@@ -52,8 +52,19 @@ class ContactSet(CollisionSet):
         if self.mollified:
             self.mollified.reserve()
 
-    def find(self, x: wp.array, law, gap: wp.array) -> None:
-        """Find the active pairs at x, and lower the smallest gaps to the candidates'."""
+    def write(self, x: wp.array, law, gap: wp.array) -> None:
+        """Find the active pairs at x, write energies, forces and factors; lower the smallest gaps to the candidates'."""
+        self._find(x, law, gap)
+        inputs = [self.pairs, self.count, self.found.sides, law, x]
+        outputs = [self.factor, self.energy, self.gradient]
+        self._take_turns(self._evaluate, self.found.capacity, inputs, outputs)
+
+    def evaluate(self, x: wp.array, law, gap: wp.array) -> None:
+        """Find and evaluate the active pairs as `write`, and build the incidence lists."""
+        self.write(x, law, gap)
+        self._items.list(self.count, self.factor)
+
+    def _find(self, x: wp.array, law, gap: wp.array) -> None:
         candidates, data = self.found, [self.found.sides, law, x]
         lists = [self.pairs, self.factor.nodes, self.starts, self.partners, self.count]
         if not self._running:
@@ -65,16 +76,6 @@ class ContactSet(CollisionSet):
             inputs = [candidates.pairs, candidates.count, candidates.starts, candidates.partners, candidates.sides]
             room = max(candidates.capacity, len(candidates.starts))
             self._take_turns(self._pack, room, [*inputs, self._marks, self._running.starts, self._tiles], lists)
-
-    def push(self, x: wp.array, law) -> None:
-        """Write energies, forces and factors of the active pairs at x."""
-        inputs = [self.pairs, self.count, self.found.sides, law, x]
-        outputs = [self.factor, self.energy, self.gradient]
-        self._take_turns(self._evaluate, self.found.capacity, inputs, outputs)
-
-    def list_pairs(self) -> None:
-        """Build the incidence lists of the active pairs."""
-        self._items.list(self.count, self.factor)
 
     def exact_product(self, v: wp.array, x: wp.array, law) -> None:
         """Write the product of the exact Hessian at x, the position of `evaluate`, with v to `placed`."""
