@@ -116,7 +116,6 @@ class RodStepAdjoint:
         self.predictor = RodPredictor.of(model, group, motion, scheme)
         terms = range(len(kind.terms))
         storage, viscous = rod_storage(kind, real), kind.viscous
-        self._vjp = elements.pull_kernel(storage, real, False, viscous)
         self._strain = [elements.strain_vjp_kernel(storage, i, real, False) for i in terms] if viscous else []
         self._nodes, self._edges = rod_elements.gather_kernels(kind, real)
         accelerations = {"a", "alpha"}
@@ -125,6 +124,8 @@ class RodStepAdjoint:
         # these add their contributions before the end update
         between = (self.supports, self.drag, self.followers, self.predictor)
         self._complete = scheme is not None and not any(between)
+        self._vjp = elements.pull_kernel(storage, real, False, viscous, not self._complete)
+        self._windows = elements.window_kernel(storage, real) if self._complete else None
         self._end, self._start = rod_step_kernels(kind, real, midpoint, self._complete)
         *_, self._update = time_step.step_kernels(kind.nodes, real, midpoint, kind.drag)
         leaves = np.tile(~group.host.fixed | _moved(group), (1, group.worlds))
@@ -231,6 +232,8 @@ class RodStepAdjoint:
         read = [group.element_inputs(kept, before.last, self._rate), inputs.load]
         written = [*map(device_arrays.columns, (window, lag, inputs.parameters, start.last, inputs.rate))]
         self._launch(self._vjp, read, written)
+        if self._windows:
+            self._launch(self._windows, [*read, self._leaves], written[:1])
         solution = [end, cotangents.end, kept.x, kept.theta, began]
         read = [*solution, inputs.load, window, lag, self._leaves, *masses, group.count]
         read += [self._rate, self._damping, self.gravity, group.world]
@@ -261,7 +264,7 @@ class RodStepAdjoint:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         result = [self._vjp, *self._strain, self._end, self._start, *self.solve.kernels]
-        result += [] if self._complete else [self._nodes, self._update]
+        result += [self._windows] if self._complete else [self._nodes, self._update]
         result += [self._edges] if self._strain else []
         parts = (self.supports, self.drag, self.followers, self.predictor)
         return result + [kernel for part in parts if part for kernel in part.kernels]

@@ -64,11 +64,8 @@ def _pull_function(storage: ElementStorage, index: int, real, adds: bool, measur
     n, two = len(term.measure.strains), term.measure.span == 2
     size, rows, lagged = density.parameter_size(n), len(term.parameter_names) - 1, density.lagged
     E, read, displacement = term.measure.types(real)[2], storage.read, storage.displacement
-    along, _ = variation_functions(term, real)
-    parameters, write_lagged = (
-        parameter_function(storage, index, real),
-        _write_lagged_function(storage, index, real, adds),
-    )
+    (along, _), parameters = variation_functions(term, real), parameter_function(storage, index, real)
+    write_lagged = _write_lagged_function(storage, index, real, adds)
     row, strain, Displacements, measured = access.parameter, access.strain, storage.Displacements, adds or measured
 
     @wp.func
@@ -110,7 +107,7 @@ def _pull_function(storage: ElementStorage, index: int, real, adds: bool, measur
 
 
 @cache
-def pull_kernel(storage: ElementStorage, real, adds: bool, measured: bool):
+def pull_kernel(storage: ElementStorage, real, adds: bool, measured: bool, windows: bool = True):
     """Build the reverse of the element forces of all terms: derivatives of -w . dE/dq by all inputs of an element.
 
     `vjp`: write the derivatives by the window, zero without an element, by lagged and constant data, rest measure, parameters, and
@@ -119,6 +116,7 @@ def pull_kernel(storage: ElementStorage, real, adds: bool, measured: bool):
     Args:
         adds: True to add all of these.
         measured: True to add the derivatives by the rest measure, where `strain_vjp_kernel` has written some.
+        windows: False to leave out the derivative by the window; see `window_kernel`.
     """
     Inputs, W, Displacements = storage.Inputs, storage.Window, storage.Displacements
     items, count_of, whole_of, column_of = storage.items, storage.count, storage.whole, storage.column
@@ -151,9 +149,80 @@ def pull_kernel(storage: ElementStorage, real, adds: bool, measured: bool):
                 f += first_term(inputs, w, lagged_out, parameter_out, last_out, rate_out, island, e, column)
         elif wp.static(adds):
             return
-        write(window_out, 0, f, column)
+        if wp.static(windows):
+            write(window_out, 0, f, column)
 
     return vjp
+
+
+@cache
+def _window_function(storage: ElementStorage, index: int, real):
+    """Return the device function `window_of`: derivative of -w . dE/dq of a term by the window."""
+    access, Inputs, Displacements = storage.terms[index], storage.Inputs, storage.Displacements
+    term, local, short, spread, two = (
+        access.term,
+        access.local,
+        access.short,
+        access.spread,
+        access.term.measure.span == 2,
+    )
+    E, read, displacement = term.measure.types(real)[2], storage.read, storage.displacement
+    (along, _), parameters = variation_functions(term, real), parameter_function(storage, index, real)
+
+    @wp.func
+    def window_of(inputs: Inputs, w: Displacements, island: int, e: int, column: int):
+        measure, p = parameters(inputs, island, e, column)
+        q, s = read(inputs, island, e, wp.static(two))
+        v = -local(displacement(inputs, w, island, e, wp.static(two)))
+        dq, _ds, _dmeasure, _dp, _dv, _de = wp.grad(along)(local(q), short(s), measure, p, v, E())
+        return spread(dq)
+
+    return window_of
+
+
+@cache
+def window_kernel(storage: ElementStorage, real):
+    """Build the kernel of derivatives of -w . dE/dq by the windows of few elements of a rod.
+
+    `windows`: write them for elements with a node that has dofs outside of the mask `leaves`.
+
+    Measured: derivatives by windows of all elements, with all others, keep 0.5 kB a thread in local memory on a GPU, else nothing.
+    """
+    Inputs, W, Displacements = storage.Inputs, storage.Window, storage.Displacements
+    items, count_of, whole_of, column_of = storage.items, storage.count, storage.whole, storage.column
+    measures = [access.term.measure for access in storage.terms]
+    first_everywhere, last_everywhere, several = measures[0].span != 2, measures[-1].span != 2, len(measures) > 1
+    first_term, last_term = (_window_function(storage, index, real) for index in (0, -1))
+    write = write_function(storage, real, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def windows(
+        inputs: Inputs, w: Displacements, leaves: wp.array2d(dtype=wp.uint8), window_out: wp.array2d(dtype=real)
+    ):
+        i, j = wp.tid()
+        island, e = items(i, j)
+        count = count_of(inputs, island)
+        if e >= count:
+            return
+        stays = False
+        for local in range(3):
+            k = wp.min(e + local, leaves.shape[0] - 1)
+            stays = stays or leaves[k, island] != wp.uint8(255)
+            if e + local >= count:  # the first nodes of a closed rod
+                stays = stays or leaves[e + local - count, island] != wp.uint8(255)
+        if not stays:
+            return
+        column = column_of(inputs, island, e)
+        whole = whole_of(inputs, island, e)
+        f = W()
+        if wp.static(several):
+            if wp.static(last_everywhere) or whole:
+                f += last_term(inputs, w, island, e, column)
+        if wp.static(first_everywhere) or whole:
+            f += first_term(inputs, w, island, e, column)
+        write(window_out, 0, f, column)
+
+    return windows
 
 
 @cache
