@@ -260,6 +260,11 @@ class RodStepAdjoint:
         self._launch(self._update, read, [out, inputs.rate])
         return start, inputs
 
+    def clear(self) -> None:
+        """Zero the gradients by the start of the last step, padding of shorter rods included."""
+        for array in self._start_state.arrays().values():
+            device_arrays.clear(array)
+
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""

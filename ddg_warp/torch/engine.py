@@ -256,12 +256,14 @@ class Engine:
         """Put failed worlds at rest before a backward pass; launches only."""
         worlds, (mask, some) = self.integrator._worlds, self._failures
         some.zero_()
-        wp.launch(self._fails, len(mask), [self._codes_then], [mask, some], device=mask.device)
+        wp.launch(self._fails, len(mask), [self._codes_then, self._lost], [mask, some], device=mask.device)
         wp.capture_if(some, lambda: self._to_rest(worlds, mask))
 
     def _to_rest(self, worlds, mask: wp.array) -> None:
         for state in (self.before, self.after):
             worlds.take_over(mask, worlds.start, state)
+        for rod_adjoint in self.adjoint.rod_adjoints:  # NaN of the last pass, which stay in the padding of shorter rods
+            rod_adjoint.clear()
         coupled = worlds.start.coupled
         for array in self._coupled.lagged if coupled else ():
             worlds.take_array(mask, coupled.q, array, self.model.worlds)

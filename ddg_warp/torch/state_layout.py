@@ -138,7 +138,7 @@ class StateLayout:
         return values
 
     def flagged(self, values: list[torch.Tensor], flags) -> list[torch.Tensor]:
-        """Return copies of the gradients by the arrays of a state; grips' are NaN in worlds with a flag that is."""
+        """Return copies of the gradients by the arrays of a state; for grips NaN in worlds with such a flag."""
         results = copies([value for value, field in zip(values, self.fields, strict=True) if field.smooth])
         smooth = [field for field in self.fields if field.smooth]
         for value, field in zip(results, smooth, strict=True) if self.model.grips else ():

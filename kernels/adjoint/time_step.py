@@ -343,7 +343,7 @@ def flag_kernels(real):
 
     `solved`: write flags of islands, NaN if the linear solve has failed.
     `excuse`: write 1 for islands with zero cotangents.
-    `failed`: mark worlds that failed.
+    `failed`: mark worlds that failed; set `any_failed` for them, and for NaN of the last backward pass (`lost`).
     """
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -370,10 +370,15 @@ def flag_kernels(real):
             out[r] = real(1.0)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def failed(codes: wp.array(dtype=int), mask: wp.array(dtype=int), any_failed: wp.array(dtype=int)):
+    def failed(
+        codes: wp.array(dtype=int),
+        lost: wp.array(dtype=int),
+        mask: wp.array(dtype=int),
+        any_failed: wp.array(dtype=int),
+    ):
         w = wp.tid()
         mask[w] = wp.where(codes[w] != 0 and codes[w] != wp.static(outcome.NO_GRADIENT), 1, 0)
-        if mask[w] != 0:
+        if mask[w] != 0 or lost[0] != 0:
             any_failed[0] = 1
 
     return solved, excuse, failed
