@@ -30,7 +30,7 @@ def rod_step_kernels(kind: RodKind, real, midpoint: bool, complete: bool):
     (dofs, store), (masses, store_masses) = dof_functions(nodes, real), mass_functions(nodes, real)
     row_of, store_row = row_functions(block, real)
     solution_of, inertia_of, start_of = step_functions(nodes, real, midpoint, kind.drag)
-    gathered, _previous = gathered_function(kind, real), node_functions(kind, real)[1]
+    gathered, (previous, _) = gathered_function(kind, real), node_functions(kind, real)
     frame_vjp = frame_function(kind, real, True) if twist else None
     add_lagged = lagged_function(kind, real) if twist else None
 
@@ -77,7 +77,7 @@ def rod_step_kernels(kind: RodKind, real, midpoint: bool, complete: bool):
                     more[d] = more[d] - de[d]
                     frame_out[d, k, r] = du[d]
                     frame_out[3 + d, k, r] = dt[d]
-            b = _previous(k, n)
+            b = previous(k, n)
             if b >= 0:
                 edge_before, _du, _dt = frame_vjp(x, frame, by_frame, b, n, r)
                 for d in range(3):
