@@ -153,7 +153,7 @@ def adjust_serially(newton, todo: int):
     wp.launch(
         rod_iterate.adjust_kernel(group.kind, newton.real, newton.linear),
         group.columns,
-        [group.count, group.fixed, group.anchor, newton.direction, *newton.islands.arrays, *copies],
+        [group.count, group.fixed, group.anchor, newton.direction, *newton.islands.arrays, *copies, None, 1.0],
         device=newton.device,
     )
     newton.islands.iterate_action.fill_(todo)  # the serial kernel has reset it
