@@ -8,9 +8,9 @@ forces on the first nodes. A rod has converged if at every free dof
     |residual| <= max(rtol * load scale, floor) ,   floor = floor_factor * eps * (H_ii |x| + sum of |element forces|) ,
 
 where the floor bounds the rounding of coordinates and forces, and |x| is the largest coordinate of the node and of the next one, whose
-edge is as exact as that. Moments are compared over the length of the rod. Sums of residuals
-have to be small, too; see `compile.residual_tolerance`. After a full Newton step they are, of second order. At the start, or after a
-shortened step, the limit is divided by the number of nodes instead.
+edge is as exact as that. Moments are compared over the length of the rod. Sums of residuals have to be small, too; see
+`compile.residual_tolerance`. After a full Newton step they are, of second order. At the start, or after a shortened step, the limit is
+divided by the number of nodes instead.
 """
 
 from functools import cache
