@@ -1,8 +1,7 @@
 """Preconditioned conjugate gradients on the coupled system, each world by itself: block Jacobi, scalars on the device.
 
 Substructuring (`rod_substructuring`) or `multilevel` update z after the kernels that start and advance a solve, before r . z is
-summed. `wanted` is 1 while a world iterates, 2 once it has converged, 3 if it cannot go on. Sums over blocks have a fixed order
-(tiles, then a tile of tiles).
+summed. `wanted` is 1 while a world iterates, 2 once it has converged, 3 if it cannot go on. Sums over blocks have a fixed order.
 """
 
 from functools import cache
@@ -13,57 +12,139 @@ from ddg_warp.kernels.core.division import nonzero_function
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.linear.sliced_ell import ALL_INACTIVE, product_functions, settle_function
 
-TILE = 4096  # entries that one block of threads sums
-TILES = 1024  # largest number of such blocks in a world
+TILE = 1024  # entries that one block of threads sums
 THREADS = 256
 
 
 @cache
-def sum_kernels(real, largest: bool = False):
-    """Build the kernels that sum rows, or find their `largest` entries.
+def reduce_function(real, largest: bool, serial: bool):
+    """Return the device function `reduce(values, tiles, partial, counts, tid, sum_out)`: sum rows, or find their `largest` entries.
 
-    `partial`: reduce tiles of values (worlds, n) to (worlds, tiles).
-    `total`: reduce tiles to (worlds,).
+    It returns the row in the thread that has completed a sum, else -1. A block of threads takes a tile of a row. The last block of a
+    row to finish adds up the sums of all tiles, in one order. On the CPU a thread takes a row.
     """
+    name = {wp.float32: "float", wp.float64: "double"}[real]
+    combine = "value < other ? other : value" if largest else "value + other"
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
-    def partial(values: wp.array2d(dtype=real), tiles_out: wp.array2d(dtype=real)):
-        w, b = wp.tid()
-        tile = wp.tile_load(values, shape=(1, wp.static(TILE)), offset=(w, b * wp.static(TILE)))
+    over_block_source = f"""
+#if defined(__CUDA_ARCH__)
+    __shared__ {name} of_warps[{THREADS // 32}];
+    for (int offset = 16; offset > 0; offset /= 2) {{
+        {name} other = __shfl_down_sync(0xffffffffu, value, offset);
+        value = {combine};
+    }}
+    __syncthreads();
+    if (threadIdx.x % 32 == 0)
+        of_warps[threadIdx.x / 32] = value;
+    __syncthreads();
+    value = of_warps[0];
+    for (int warp = 1; warp < {THREADS // 32}; ++warp) {{
+        {name} other = of_warps[warp];
+        value = {combine};
+    }}
+#endif
+    return value;
+"""
+    is_last_source = """
+#if defined(__CUDA_ARCH__)
+    __shared__ int last;
+    if (threadIdx.x == 0) {
+        partial.data[block] = value;
+        __threadfence();
+        last = atomicAdd(&counts.data[row], 1) == tiles - 1;
+    }
+    __syncthreads();
+    __threadfence();
+    return last;
+#else
+    return 1;
+#endif
+"""
+    uncached_source = """
+#if defined(__CUDA_ARCH__)
+    return __ldcg(&partial.data[k]);
+#else
+    return partial.data[k];
+#endif
+"""
+
+    @wp.func_native(over_block_source)
+    def over_block(value: real) -> real:
+        """Return the sum of the values of all threads of a block."""
+        ...
+
+    @wp.func_native(is_last_source)
+    def is_last(
+        partial: wp.array(dtype=real), counts: wp.array(dtype=int), value: real, block: int, row: int, tiles: int
+    ) -> int:
+        """Write the sum of a block; return 1 in all threads of the last block of a row."""
+        ...
+
+    @wp.func_native(uncached_source)
+    def uncached(partial: wp.array(dtype=real), k: int) -> real:
+        """Return an entry that another multiprocessor may have written."""
+        ...
+
+    @wp.func
+    def combined(a: real, b: real):
         if wp.static(largest):
-            wp.tile_store(tiles_out[w], wp.tile_max(tile), offset=b)
+            return wp.max(a, b)
         else:
-            wp.tile_store(tiles_out[w], wp.tile_sum(tile), offset=b)
+            return a + b
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
-    def total(tiles: wp.array2d(dtype=real), sum_out: wp.array(dtype=real)):
-        w = wp.tid()
-        tile = wp.tile_load(tiles, shape=(1, wp.static(TILES)), offset=(w, 0))
-        if wp.static(largest):
-            wp.tile_store(sum_out, wp.tile_max(tile), offset=w)
+    @wp.func
+    def reduce(
+        values: wp.array2d(dtype=real),
+        tiles: int,
+        partial: wp.array(dtype=real),
+        counts: wp.array(dtype=int),
+        tid: int,
+        sum_out: wp.array(dtype=real),
+    ):
+        s = real(0.0)
+        if wp.static(serial):
+            for k in range(values.shape[1]):
+                s = combined(s, values[tid, k])
+            sum_out[tid] = s
+            return tid
         else:
-            wp.tile_store(sum_out, wp.tile_sum(tile), offset=w)
+            block = tid / wp.static(THREADS)
+            t = tid - block * wp.static(THREADS)
+            row = block / tiles
+            first = (block - row * tiles) * wp.static(TILE)
+            for k in range(first + t, wp.min(first + wp.static(TILE), values.shape[1]), wp.static(THREADS)):
+                s = combined(s, values[row, k])
+            s = over_block(s)
+            if tiles > 1:
+                if is_last(partial, counts, s, block, row, tiles) == 0:
+                    return int(-1)
+                s = real(0.0)
+                for k in range(t, tiles, wp.static(THREADS)):
+                    s = combined(s, uncached(partial, row * tiles + k))
+                s = over_block(s)
+            if t > 0:
+                return int(-1)
+            counts[row] = 0
+            sum_out[row] = s
+            return row
 
-    return partial, total
+    return reduce
 
 
 @cache
-def serial_sum_kernel(real, largest: bool = False):
-    """Build the kernel that sums rows, or finds their `largest` entries, on the CPU.
+def sum_kernel(real, largest: bool, serial: bool):
+    """Build the kernel `total` that sums rows of values (rows, n), or finds their `largest` entries."""
+    reduce = reduce_function(real, largest, serial)
 
-    `total`: reduce values (worlds, n) to (worlds,), one thread a row.
-    """
-
-    @wp.kernel(module="unique", enable_backward=False, module_options=CPU_OPTIONS)
-    def total(values: wp.array2d(dtype=real), sum_out: wp.array(dtype=real)):
-        w = wp.tid()
-        s = real(0.0)
-        for i in range(values.shape[1]):
-            if wp.static(largest):
-                s = wp.max(s, values[w, i])
-            else:
-                s += values[w, i]
-        sum_out[w] = s
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def total(
+        values: wp.array2d(dtype=real),
+        tiles: int,
+        partial: wp.array(dtype=real),
+        counts: wp.array(dtype=int),
+        sum_out: wp.array(dtype=real),
+    ):
+        reduce(values, tiles, partial, counts, wp.tid(), sum_out)
 
     return total
 
@@ -97,7 +178,7 @@ def inverse_function(linear):
 
 
 @cache
-def solver_kernels(linear, indefinite: bool = False, angles: bool = False):
+def solver_kernels(linear, indefinite: bool = False, angles: bool = False, serial: bool = False):
     """Build the kernels of a solve, in the order of use.
 
     `invert`: invert diagonal blocks.
@@ -105,8 +186,8 @@ def solver_kernels(linear, indefinite: bool = False, angles: bool = False):
     `begin`: store the first r . z of each world.
     `product`: compute H p and p . H p.
     `advance`: step along p and precondition the new residual.
+    `test`: sum r . z, and test convergence of each world.
     `turn`: update the search direction.
-    `test`: test convergence of each world.
 
     `angles`: True if some blocks are twist angles, see `sliced_ell.product_functions`.
 
@@ -117,6 +198,7 @@ def solver_kernels(linear, indefinite: bool = False, angles: bool = False):
     _, free = product_functions(linear)
     settle = settle_function(linear, angles)
     inverse_of, nonzero = inverse_function(linear), nonzero_function(linear)
+    reduce = reduce_function(linear, False, serial)
     eps = wp.constant(linear(2.3e-16 if linear == wp.float64 else 1.2e-7))
 
     @wp.func
@@ -272,13 +354,16 @@ def solver_kernels(linear, indefinite: bool = False, angles: bool = False):
         residual: wp.array(dtype=H),
         z_out: wp.array(dtype=H),
         dots_out: wp.array2d(dtype=linear),
+        beta_out: wp.array(dtype=linear),
         busy_out: wp.array(dtype=int),
     ):
-        """Step along p; write the new residual, z and r . z by block. `test` raises `busy_out` afterwards."""
+        """Step along p; write the new residual, z and r . z by block. `test` raises `busy_out` and `beta_out` afterwards."""
         i = wp.tid()
         w = i / blocks
         if i == 0:
             busy_out[0] = 0
+        if i == w * blocks:
+            beta_out[w] = linear(0.0)
         if wanted[w] != 1 or inactive_mask[i] == ALL_INACTIVE:
             return
         k = i - w * blocks
@@ -296,29 +381,18 @@ def solver_kernels(linear, indefinite: bool = False, angles: bool = False):
             dots_out[w, k] = wp.dot(r, z)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def turn(
-        z: wp.array(dtype=H),
-        total: wp.array(dtype=linear),
-        rho: wp.array(dtype=linear),
-        inactive_mask: wp.array(dtype=wp.uint8),
-        wanted: wp.array(dtype=int),
-        blocks: int,
-        p: wp.array(dtype=H),
-    ):
-        """Write the next search direction."""
-        i = wp.tid()
-        w = i / blocks
-        if wanted[w] == 1 and inactive_mask[i] != ALL_INACTIVE:
-            p[i] = z[i] + (total[w] / rho[w]) * p[i]
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def test(
-        total: wp.array(dtype=linear),
+        dots: wp.array2d(dtype=linear),
+        tiles: int,
+        partial: wp.array(dtype=linear),
+        counts: wp.array(dtype=int),
         curvature: wp.array(dtype=linear),
         first: wp.array(dtype=linear),
         forcing: wp.array(dtype=linear),
         limit: int,
+        total: wp.array(dtype=linear),
         rho: wp.array(dtype=linear),
+        beta: wp.array(dtype=linear),
         iterations: wp.array(dtype=int),
         negative: wp.array(dtype=int),
         wanted: wp.array(dtype=int),
@@ -328,8 +402,8 @@ def solver_kernels(linear, indefinite: bool = False, angles: bool = False):
 
         `negative` marks negative curvature, and an indefinite preconditioner, for which that norm is negative or not finite.
         """
-        w = wp.tid()
-        if wanted[w] != 1:
+        w = reduce(dots, tiles, partial, counts, wp.tid(), total)
+        if w < 0 or wanted[w] != 1:
             return
         iterations[w] = iterations[w] + 1
         enough = forcing[w] * forcing[w] * first[w]
@@ -337,6 +411,7 @@ def solver_kernels(linear, indefinite: bool = False, angles: bool = False):
         if not (curvature[w] > linear(0.0) and definite):
             negative[w] = 1
         lost = ends(curvature[w], rho[w]) or not definite
+        beta[w] = total[w] / rho[w]
         rho[w] = total[w]
         if lost or iterations[w] >= limit:
             wanted[w] = 3
@@ -345,7 +420,21 @@ def solver_kernels(linear, indefinite: bool = False, angles: bool = False):
         else:
             wanted[w] = 2
 
-    return invert, start, begin, product, advance, turn, test
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def turn(
+        z: wp.array(dtype=H),
+        beta: wp.array(dtype=linear),
+        inactive_mask: wp.array(dtype=wp.uint8),
+        blocks: int,
+        p: wp.array(dtype=H),
+    ):
+        """Write the next search direction of worlds that have iterated."""
+        i = wp.tid()
+        factor = beta[i / blocks]
+        if factor != linear(0.0) and inactive_mask[i] != ALL_INACTIVE:
+            p[i] = z[i] + factor * p[i]
+
+    return invert, start, begin, product, advance, test, turn
 
 
 @cache

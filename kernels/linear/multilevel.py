@@ -1,20 +1,25 @@
-"""BPX multilevel preconditioner of the coupled system: block Jacobi on every level of hat functions, summed.
+"""Multilevel preconditioner of the coupled system: block Jacobi of nodes, and hat functions of all levels above.
 
 Hats of level l are trilinear on a background grid over the rest shape, and cut by connectivity. The three dofs of a node have the same
-weight; see `ddg_warp.solve.linear.hat_functions`. With P_l the prolongation from level l to the nodes, and D_l the diagonal
-blocks of the Galerkin matrix A_l = P_l^T A_0 P_l,
+weight; see `ddg_warp.solve.linear.hat_functions`. With P_l the prolongation from level l to the nodes, and the Galerkin matrix
+A_l = P_l^T A_0 P_l with diagonal blocks D_l,
 
-    z = D_0^-1 r + sum_l P_l D_l^-1 P_l^T r + P_t V_t P_t^T r,   l < t
+    z = D_0^-1 r + P_1 D_1^-1 P_1^T r + P_2 V_2 P_2^T r.
 
-(Bramble, Pasciak and Xu 1990). V_t is a V-cycle over the small levels, which one block of threads runs in one launch. It smooths by
-damped block Jacobi before and after each correction, so that it is symmetric, and definite even if A_t is not.
+The two finest levels are additive (Bramble, Pasciak and Xu 1990), as their matrices are large. V_2 is a V-cycle over all other levels;
+small sheets have V_1. It smooths by damped block Jacobi before and after each correction, so that it is symmetric, and definite even
+if A_2 is not.
 
 D_0^-1 r may come from substructuring (`rod_substructuring`). A_0 is the sparse matrix of nodes on free dofs, with the diagonal blocks
 of contact. Twist angles and other rotations have the finest level only.
 
-Measured: a sheet of 128 x 128 takes 27 iterations a step of 1/240 s, and one of 64 x 64 takes 20; without the V-cycle 38 and 31. Groups
-of nodes that translate as one piece take 155 and 101: a jump costs the size of the group over the mesh width times the energy of a
-smooth displacement.
+Hats of all levels have one numbering, from fine to coarse. With B = A_l P for the prolongation P from level l + 1 to l, a correction e
+of level l + 1 changes the residual r - A_l z to r - A_l z - B e: one more product a level. Each of these steps is a launch, as one
+block of threads reads a matrix slowly. The last levels share one block, as launches would take longer there.
+
+Measured: a sheet of 512 x 512 takes 39 iterations a step of 1/240 s, and one of 256 x 256 takes 33; with V-cycles from 1,089 hats on
+51 and 35, and without 72 and 48. Groups of nodes that translate as one piece take 875 and 430: a jump costs the size of the group over
+the mesh width times the energy of a smooth displacement.
 """
 
 from functools import cache
@@ -25,9 +30,8 @@ from ddg_warp.kernels.core.division import nonzero_function
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function, wait
 from ddg_warp.kernels.linear.sliced_ell import SLICE, product_functions
 
-# Hats of the largest level of the V-cycle, and threads of its block: a thread has two rows of that level.
-SMALL = 1280
-SMALL_THREADS = 640
+SMALL = 512  # hats up to which a level has no launches of its own; threads of the block of such levels
+LARGE = 5000  # hats up to which the finest level is not additive, at least `SMALL`
 POWER = 8  # power iterations for the largest eigenvalue of D^-1 A
 DAMPING = 1.6 / 1.1  # over that eigenvalue, which the power iteration underestimates by less than 1.25
 
@@ -45,34 +49,31 @@ def list_type(linear):
     return WeightedList
 
 
-@wp.struct
-class Pattern:
-    """Sparsity pattern of one world: row and column of each entry, offsets of rows."""
+@cache
+def sliced_type(linear):
+    """Return the struct of a matrix of blocks in sliced ELLPACK, as H; see `sliced_ell`. `positions`: entries in a world."""
 
-    rows: wp.array(dtype=int)
-    columns: wp.array(dtype=int)
-    starts: wp.array(dtype=int)
+    @wp.struct
+    class SlicedMatrix:
+        rows: wp.array(dtype=int)
+        columns: wp.array(dtype=int)
+        slices: wp.array(dtype=int)
+        values: wp.array2d(dtype=linear)
+        positions: int
 
-
-@wp.struct
-class Tail:
-    """Small levels in one numbering: first hat of each level and the end, and the rows of all matrices."""
-
-    bounds: wp.array(dtype=int)
-    starts: wp.array(dtype=int)
-    columns: wp.array(dtype=int)
+    return SlicedMatrix
 
 
 @cache
 def weighted_sum_function(linear):
-    """Return the device function `weighted_sum(list, k, values, w)`: weighted sum of the values of list k in world w."""
+    """Return the device function `weighted_sum(list, k, values, shift)`: weighted sum of the values of list k, from `shift` on."""
     H = wp.types.vector(3, linear)
 
     @wp.func
-    def weighted_sum(list: list_type(linear), k: int, values: wp.array2d(dtype=H), w: int):
+    def weighted_sum(list: list_type(linear), k: int, values: wp.array(dtype=H), shift: int):
         total = H()
         for index in range(list.starts[k], list.starts[k + 1]):
-            total += list.weights[index] * values[w, list.items[index]]
+            total += list.weights[index] * values[list.items[index] + shift]
         return total
 
     return weighted_sum
@@ -80,17 +81,18 @@ def weighted_sum_function(linear):
 
 @cache
 def setup_kernels(linear, serial: bool):
-    """Build the kernels that set up levels, one thread an entry of the result, or a row of the finest matrix.
+    """Build the kernels that set up levels.
 
     `begin`: find the worlds that need a set-up.
-    `spread`: compute A P for the finest matrix A.
-    `spread_coarse`: compute A P for the matrix of a level.
-    `contract`: compute P^T (A P).
-    `invert`: invert the diagonal blocks of a level.
+    `spread`: compute A P, one thread an entry.
+    `contract`: compute P^T (A P), one thread an entry.
+    `invert`: invert diagonal blocks, one thread a hat.
+    `iterate`: multiply a vector by D^-1 A, one thread a hat.
+    `damp`: scale the inverses of a level for the smoother, one block of threads a level.
     """
     H, M, until = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear), until_function(serial)
-    List = list_type(linear)
-    _, free = product_functions(linear)
+    List, Sliced = list_type(linear), sliced_type(linear)
+    times, free = product_functions(linear)
     nonzero = nonzero_function(linear)
 
     @wp.func
@@ -100,6 +102,37 @@ def setup_kernels(linear, serial: bool):
             if list.items[k] == item:
                 return list.weights[k]
         return linear(0.0)
+
+    @wp.func
+    def block_of(values: wp.array2d(dtype=linear), p: int):
+        m = M()
+        for a in range(3):
+            for b in range(3):
+                m[a, b] = values[3 * a + b, p]
+        return m
+
+    @wp.func
+    def store(values: wp.array2d(dtype=linear), p: int, m: M):
+        for a in range(3):
+            for b in range(3):
+                values[3 * a + b, p] = m[a, b]
+
+    @wp.func
+    def position_of(matrix: Sliced, row: int, column: int):
+        """Return the position of an entry, -1 if absent; columns of a row are sorted, -1 in the padding at its end."""
+        slice = row / wp.static(SLICE)
+        start = matrix.slices[slice] + row - slice * wp.static(SLICE)
+        low, high = int(0), (matrix.slices[slice + 1] - matrix.slices[slice]) / wp.static(SLICE)
+        while low < high:
+            middle = (low + high) / 2
+            c = matrix.columns[start + middle * wp.static(SLICE)]
+            if c == column:
+                return start + middle * wp.static(SLICE)
+            if c >= 0 and c < column:
+                low = middle + 1
+            else:
+                high = middle
+        return int(-1)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def begin(
@@ -117,123 +150,87 @@ def setup_kernels(linear, serial: bool):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def spread(
-        matrix: wp.array2d(dtype=linear),
-        columns: wp.array(dtype=int),
-        slices: wp.array(dtype=int),
-        positions: int,
+        matrix: Sliced,
         fixed: wp.array(dtype=wp.uint8),
         more: wp.array(dtype=M),
         blocks: int,
-        nodes: int,
+        points: int,
         parents: List,
-        pattern: Pattern,
+        first: int,
+        count: int,
         outdated: wp.array(dtype=int),
-        product_out: wp.array(dtype=M),
+        product: Sliced,
     ):
-        """Write a row of A P on free dofs; `more` is added to diagonal blocks if not empty."""
+        """Write `count` entries of A P from `first` on, with the rows and columns of A up to `points`.
+
+        Finest matrix: `fixed` has the bits of fixed dofs, and `more` diagonal blocks to be added; both are empty for others.
+        """
         start = wp.tid()
-        entries = pattern.rows.shape[0]
-        for t in range(start, until(start, outdated.shape[0] * nodes)):
-            w = t / nodes
+        for t in range(start, until(start, outdated.shape[0] * count)):
+            w = t / count
             if outdated[w] == 0:
                 continue
-            i = t - w * nodes
-            first, end = pattern.starts[i], pattern.starts[i + 1]
-            for q in range(first, end):
-                product_out[q + w * entries] = M()
+            q = first + t - w * count
+            i, hat = product.rows[q], product.columns[q]
+            if i < 0:
+                continue
             slice = i / wp.static(SLICE)
-            for p in range(slices[slice] + i - slice * wp.static(SLICE), slices[slice + 1], wp.static(SLICE)):
-                j = columns[p]
-                if j < 0 or j >= nodes:
+            total = M()
+            for p in range(
+                matrix.slices[slice] + i - slice * wp.static(SLICE), matrix.slices[slice + 1], wp.static(SLICE)
+            ):
+                j = matrix.columns[p]
+                if j < 0 or j >= points:
                     continue
-                block = M()
-                for a in range(3):
-                    for b in range(3):
-                        block[a, b] = matrix[3 * a + b, p + w * positions]
-                if i == j and more.shape[0] > 0:
-                    block += more[i + w * blocks]
-                block = wp.cw_mul(block, wp.outer(free(fixed[i]), free(fixed[j])))
-                for k in range(parents.starts[j], parents.starts[j + 1]):
-                    q = int(first)
-                    while pattern.columns[q] != parents.items[k]:
-                        q += 1
-                    q += w * entries
-                    product_out[q] = product_out[q] + parents.weights[k] * block
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def spread_coarse(
-        matrix: wp.array2d(dtype=M),
-        matrix_pattern: Pattern,
-        parents: List,
-        pattern: Pattern,
-        outdated: wp.array(dtype=int),
-        product_out: wp.array(dtype=M),
-    ):
-        start = wp.tid()
-        entries = pattern.rows.shape[0]
-        for t in range(start, until(start, outdated.shape[0] * entries)):
-            w = t / entries
-            if outdated[w] == 0:
-                continue
-            i, hat = pattern.rows[t - w * entries], pattern.columns[t - w * entries]
-            m = M()
-            for p in range(matrix_pattern.starts[i], matrix_pattern.starts[i + 1]):
-                c = weight_of(parents, matrix_pattern.columns[p], hat)
+                c = weight_of(parents, j, hat)
                 if c > linear(0.0):
-                    m += c * matrix[w, p]
-            product_out[t] = m
+                    block = block_of(matrix.values, p + w * matrix.positions)
+                    if i == j and more.shape[0] > 0:
+                        block += more[i + w * blocks]
+                    if fixed.shape[0] > 0:
+                        block = wp.cw_mul(block, wp.outer(free(fixed[i]), free(fixed[j])))
+                    total += c * block
+            store(product.values, q + w * product.positions, total)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def contract(
-        product: wp.array(dtype=M),
-        product_pattern: Pattern,
-        members: List,
-        pattern: Pattern,
-        outdated: wp.array(dtype=int),
-        matrix_out: wp.array2d(dtype=M),
-    ):
+    def contract(product: Sliced, members: List, first: int, count: int, outdated: wp.array(dtype=int), matrix: Sliced):
+        """Write `count` entries of P^T (A P) from `first` on."""
         start = wp.tid()
-        entries = pattern.rows.shape[0]
-        for t in range(start, until(start, outdated.shape[0] * entries)):
-            w = t / entries
+        for t in range(start, until(start, outdated.shape[0] * count)):
+            w = t / count
             if outdated[w] == 0:
                 continue
-            row, column = pattern.rows[t - w * entries], pattern.columns[t - w * entries]
-            first = w * product_pattern.rows.shape[0]
-            m = M()
+            p = first + t - w * count
+            row, column = matrix.rows[p], matrix.columns[p]
+            if row < 0:
+                continue
+            total = M()
             for k in range(members.starts[row], members.starts[row + 1]):
-                i = members.items[k]
-                low, high = int(product_pattern.starts[i]), int(product_pattern.starts[i + 1])
-                while low < high:  # columns are sorted
-                    middle = (low + high) / 2
-                    if product_pattern.columns[middle] < column:
-                        low = middle + 1
-                    else:
-                        high = middle
-                if low < product_pattern.starts[i + 1] and product_pattern.columns[low] == column:
-                    m += members.weights[k] * product[low + first]
-            matrix_out[w, t - w * entries] = m
+                q = position_of(product, members.items[k], column)
+                if q >= 0:
+                    total += members.weights[k] * block_of(product.values, q + w * product.positions)
+            store(matrix.values, p + w * matrix.positions, total)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def invert(
-        matrix: wp.array2d(dtype=M),
+        matrix: Sliced,
         diagonal: wp.array(dtype=int),
         members: List,
         additive: int,
+        hats: int,
         outdated: wp.array(dtype=int),
-        inverse_out: wp.array2d(dtype=M),
+        inverse_out: wp.array(dtype=M),
     ):
-        """Write inverses of diagonal blocks; zero on an additive level for a hat of one member, which has that correction itself."""
+        """Write inverses of diagonal blocks; zero for a hat before `additive` with one member, which has that correction itself."""
         i = wp.tid()
-        hats = diagonal.shape[0]
         w = i / hats
         if outdated[w] == 0:
             return
         k = i - w * hats
-        if additive != 0 and members.starts[k + 1] - members.starts[k] == 1:
-            inverse_out[w, k] = M()
+        if diagonal[k] < 0 or (k < additive and members.starts[k + 1] - members.starts[k] == 1):
+            inverse_out[i] = M()
             return
-        m = matrix[w, diagonal[k]]
+        m = block_of(matrix.values, diagonal[k] + w * matrix.positions)
         s = H()
         for d in range(3):
             s[d] = wp.where(m[d, d] > linear(0.0), linear(1.0) / wp.sqrt(nonzero(m[d, d])), linear(0.0))
@@ -245,215 +242,269 @@ def setup_kernels(linear, serial: bool):
         # Rounding may leave a block of a high level indefinite: the diagonal serves as well.
         if not (wp.determinant(scaled) > linear(1.0e-4)):
             inverse = wp.diag(wp.cw_mul(s, s))
-        inverse_out[w, k] = inverse
+        inverse_out[i] = inverse
 
-    return begin, spread, spread_coarse, contract, invert
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def iterate(
+        matrix: Sliced,
+        inverse: wp.array(dtype=M),
+        first: int,
+        count: int,
+        hats: int,
+        begins: bool,
+        outdated: wp.array(dtype=int),
+        v: wp.array(dtype=H),
+        next_out: wp.array(dtype=H),
+        dots_out: wp.array2d(dtype=linear),
+    ):
+        """Write D^-1 A v for the hats from `first` on, and A v . D^-1 A v and A v . v; the first v has all eigenvectors in it."""
+        start = wp.tid()
+        for t in range(start, until(start, outdated.shape[0] * count)):
+            w = t / count
+            if outdated[w] == 0:
+                continue
+            k = first + t - w * count
+            i = k + w * hats
+            if begins:
+                y = H()
+                for d in range(3):
+                    y[d] = linear((k * 7919 + d * 4099) % 13 - 6)
+                next_out[i] = y
+            else:
+                product = times(
+                    matrix.values, matrix.columns, matrix.slices, v, k, w * matrix.positions, w * hats, hats, hats
+                )
+                y = inverse[i] * product
+                next_out[i] = y
+                dots_out[0, i] = wp.dot(product, y)
+                dots_out[1, i] = wp.dot(product, v[i])
+
+    @wp.kernel(
+        module="unique", enable_backward=False, grid_stride=False, launch_bounds=SMALL, module_options=CPU_OPTIONS
+    )
+    def damp(
+        bounds: wp.array(dtype=int),
+        level: int,
+        levels: int,
+        hats: int,
+        threads: int,
+        dots: wp.array2d(dtype=linear),
+        outdated: wp.array(dtype=int),
+        sums: wp.array2d(dtype=linear),
+        inverse: wp.array(dtype=M),
+    ):
+        """Scale the inverses of `levels` levels from `level` on by the damping over the largest eigenvalue of D^-1 A."""
+        i = wp.tid()
+        block = i / threads
+        t = i - block * threads
+        w = block / levels
+        if outdated[w] == 0:
+            return
+        own = level + block - w * levels
+        first, end = int(bounds[own] + w * hats), int(bounds[own + 1] + w * hats)
+        above, below = linear(0.0), linear(0.0)
+        for k in range(first + t, end, threads):
+            above += dots[0, k]
+            below += dots[1, k]
+        sums[0, i] = above
+        sums[1, i] = below
+        wait()
+        above, below = linear(0.0), linear(0.0)
+        for k in range(i - t, i - t + threads):
+            above += sums[0, k]
+            below += sums[1, k]
+        largest = linear(3.0)  # if A is not definite
+        if below > linear(0.0) and above < linear(1.0e6) * below:
+            largest = wp.max(above / below, linear(1.0))
+        damping = linear(wp.static(DAMPING)) / largest
+        for k in range(first + t, end, threads):
+            inverse[k] = damping * inverse[k]
+
+    return begin, spread, contract, invert, iterate, damp
 
 
 @cache
-def level_kernels(linear):
+def level_kernels(linear, serial: bool):
     """Build the kernels that apply levels, one thread a hat or a block.
 
-    `restrict`: sum a vector over the members of a hat.
-    `correct`: compute the correction of a hat.
+    `restrict`: sum a vector over the members of a hat, and smooth.
+    `subtract`: compute the residual of the smoothed vector.
+    `correct`: add the correction of the level above, and smooth again.
+    `cycle`: run these over the last levels, one block of threads a world.
     `finish`: add the corrections to z, and write r . z.
     """
-    H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
-    List = list_type(linear)
-    _, free = product_functions(linear)
+    H, M, until = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear), until_function(serial)
+    List, Sliced = list_type(linear), sliced_type(linear)
+    times, free = product_functions(linear)
     weighted_sum = weighted_sum_function(linear)
+
+    @wp.func
+    def product_of(matrix: Sliced, v: wp.array(dtype=H), k: int, w: int, hats: int):
+        return times(matrix.values, matrix.columns, matrix.slices, v, k, w * matrix.positions, w * hats, hats, hats)
+
+    @wp.func
+    def corrected(
+        product: Sliced,
+        inverse: wp.array(dtype=M),
+        parents: List,
+        above: wp.array(dtype=H),
+        change: wp.array(dtype=H),
+        z: wp.array(dtype=H),
+        k: int,
+        w: int,
+        hats: int,
+    ):
+        i = k + w * hats
+        remaining = change[i] - product_of(product, above, k, w, hats)
+        return z[i] + weighted_sum(parents, k, above, w * hats) + inverse[i] * remaining
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def restrict(
-        values: wp.array2d(dtype=H),
+        values: wp.array(dtype=H),
+        points: int,
         members: List,
+        inverse: wp.array(dtype=M),
+        first: int,
+        count: int,
         hats: int,
         wanted: wp.array(dtype=int),
-        sum_out: wp.array2d(dtype=H),
+        residual_out: wp.array(dtype=H),
+        z_out: wp.array(dtype=H),
     ):
-        i = wp.tid()
-        w = i / hats
-        if wanted[w] == 1:
-            k = i - w * hats
-            sum_out[w, k] = weighted_sum(members, k, values, w)
+        """Write residual and D^-1 residual of `count` hats from `first` on; `values` has `points` in a world."""
+        start = wp.tid()
+        for t in range(start, until(start, wanted.shape[0] * count)):
+            w = t / count
+            if wanted[w] == 1:
+                k = first + t - w * count
+                i = k + w * hats
+                r = weighted_sum(members, k, values, w * points)
+                residual_out[i] = r
+                z_out[i] = inverse[i] * r
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def subtract(
+        matrix: Sliced,
+        residual: wp.array(dtype=H),
+        z: wp.array(dtype=H),
+        first: int,
+        count: int,
+        hats: int,
+        wanted: wp.array(dtype=int),
+        change_out: wp.array(dtype=H),
+    ):
+        """Write r - A z of `count` hats from `first` on."""
+        start = wp.tid()
+        for t in range(start, until(start, wanted.shape[0] * count)):
+            w = t / count
+            if wanted[w] == 1:
+                k = first + t - w * count
+                change_out[k + w * hats] = residual[k + w * hats] - product_of(matrix, z, k, w, hats)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def correct(
-        inverse: wp.array2d(dtype=M),
-        sums: wp.array2d(dtype=H),
-        above: wp.array2d(dtype=H),
+        product: Sliced,
+        inverse: wp.array(dtype=M),
         parents: List,
+        above: wp.array(dtype=H),
+        change: wp.array(dtype=H),
+        z: wp.array(dtype=H),
+        first: int,
+        count: int,
         hats: int,
+        smooths: bool,
         wanted: wp.array(dtype=int),
-        correction_out: wp.array2d(dtype=H),
+        correction_out: wp.array(dtype=H),
     ):
-        """Write the correction of a hat: its own, and the interpolated correction of the level above."""
-        i = wp.tid()
-        w = i / hats
-        if wanted[w] == 1:
-            k = i - w * hats
-            correction_out[w, k] = inverse[w, k] * sums[w, k] + weighted_sum(parents, k, above, w)
+        """Write the correction of `count` hats from `first` on: z, the correction `above`, and if it `smooths` their residual's."""
+        start = wp.tid()
+        for t in range(start, until(start, wanted.shape[0] * count)):
+            w = t / count
+            if wanted[w] == 1:
+                k = first + t - w * count
+                i = k + w * hats
+                if smooths:
+                    correction_out[i] = corrected(product, inverse, parents, above, change, z, k, w, hats)
+                else:
+                    correction_out[i] = z[i] + weighted_sum(parents, k, above, w * hats)
+
+    @wp.kernel(
+        module="unique", enable_backward=False, grid_stride=False, launch_bounds=SMALL, module_options=CPU_OPTIONS
+    )
+    def cycle(
+        values: wp.array(dtype=H),
+        points: int,
+        members: List,
+        parents: List,
+        matrix: Sliced,
+        product: Sliced,
+        inverse: wp.array(dtype=M),
+        bounds: wp.array(dtype=int),
+        from_level: int,
+        hats: int,
+        threads: int,
+        wanted: wp.array(dtype=int),
+        residual: wp.array(dtype=H),
+        change: wp.array(dtype=H),
+        z: wp.array(dtype=H),
+        correction: wp.array(dtype=H),
+    ):
+        """Restrict `values` of the level below to the levels from `from_level` on, and write their correction."""
+        tid = wp.tid()
+        w = tid / threads
+        t = tid - w * threads
+        if wanted[w] != 1:
+            return
+        last = bounds.shape[0] - 2
+        for level in range(from_level, last + 1):
+            first, end = int(bounds[level] + t), int(bounds[level + 1])
+            for k in range(first, end, threads):
+                i = k + w * hats
+                r = H()
+                if level == from_level:
+                    r = weighted_sum(members, k, values, w * points)
+                else:
+                    r = weighted_sum(members, k, change, w * hats)
+                residual[i] = r
+                y = inverse[i] * r
+                z[i] = y
+                if level == last:
+                    correction[i] = y
+            wait()
+            if level < last:
+                for k in range(first, end, threads):
+                    change[k + w * hats] = residual[k + w * hats] - product_of(matrix, z, k, w, hats)
+                wait()
+        for down in range(last - from_level):
+            level = last - 1 - down
+            for k in range(bounds[level] + t, bounds[level + 1], threads):
+                correction[k + w * hats] = corrected(product, inverse, parents, correction, change, z, k, w, hats)
+            wait()
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def finish(
         residual: wp.array(dtype=H),
-        correction: wp.array2d(dtype=H),
+        correction: wp.array(dtype=H),
         parents: List,
         inactive_mask: wp.array(dtype=wp.uint8),
         nodes: int,
         blocks: int,
+        hats: int,
         wanted: wp.array(dtype=int),
         z: wp.array(dtype=H),
         dots_out: wp.array2d(dtype=linear),
     ):
         """Add the corrections to z, which holds D_0^-1 r, and write r . z."""
-        i = wp.tid()
-        w = i / blocks
-        if wanted[w] != 1:
-            return
-        k = i - w * blocks
-        y = z[i]
-        if k < nodes:
-            y += wp.cw_mul(weighted_sum(parents, k, correction, w), free(inactive_mask[i]))
-        z[i] = y
-        dots_out[w, k] = wp.dot(residual[i], y)
+        start = wp.tid()
+        for i in range(start, until(start, wanted.shape[0] * blocks)):
+            w = i / blocks
+            if wanted[w] != 1:
+                continue
+            k = i - w * blocks
+            y = z[i]
+            if k < nodes:
+                y += wp.cw_mul(weighted_sum(parents, k, correction, w * hats), free(inactive_mask[i]))
+            z[i] = y
+            dots_out[w, k] = wp.dot(residual[i], y)
 
-    return restrict, correct, finish
-
-
-@cache
-def tail_kernels(linear):
-    """Build the kernels of the V-cycle over small levels, one block of threads a world.
-
-    `damp`: find the damping of each level's smoother.
-    `cycle`: compute the correction of the largest small level.
-    """
-    H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
-    List = list_type(linear)
-    weighted_sum = weighted_sum_function(linear)
-
-    @wp.func
-    def row(tail: Tail, matrix: wp.array2d(dtype=M), v: wp.array2d(dtype=H), w: int, k: int):
-        """Return row k of A v."""
-        total = H()
-        for p in range(tail.starts[k], tail.starts[k + 1]):
-            total += matrix[w, p] * v[w, tail.columns[p]]
-        return total
-
-    @wp.kernel(
-        module="unique",
-        enable_backward=False,
-        grid_stride=False,
-        launch_bounds=SMALL_THREADS,
-        module_options=CPU_OPTIONS,
-    )
-    def damp(
-        tail: Tail,
-        matrix: wp.array2d(dtype=M),
-        inverse: wp.array2d(dtype=M),
-        threads: int,
-        outdated: wp.array(dtype=int),
-        v: wp.array2d(dtype=H),
-        next: wp.array2d(dtype=H),
-        dots: wp.array2d(dtype=linear),
-        damping_out: wp.array2d(dtype=linear),
-    ):
-        i = wp.tid()
-        w = i / threads
-        t = i - w * threads
-        if outdated[w] == 0:
-            return
-        last = tail.bounds.shape[0] - 2
-        for level in range(last):
-            first, end = int(tail.bounds[level] + t), int(tail.bounds[level + 1])
-            for k in range(first, end, threads):
-                start = H()
-                for d in range(3):  # any vector along all eigenvectors
-                    start[d] = linear((k * 7919 + d * 4099) % 13 - 6)
-                v[w, k] = start
-            wait()
-            for _ in range(wp.static(POWER)):
-                for k in range(first, end, threads):
-                    next[w, k] = inverse[w, k] * row(tail, matrix, v, w, k)
-                wait()
-                for k in range(first, end, threads):
-                    v[w, k] = next[w, k]
-                wait()
-            above, below = linear(0.0), linear(0.0)
-            for k in range(first, end, threads):
-                product = row(tail, matrix, v, w, k)
-                above += wp.dot(product, inverse[w, k] * product)
-                below += wp.dot(product, v[w, k])
-            dots[w, 2 * t] = above
-            dots[w, 2 * t + 1] = below
-            wait()
-            if t == 0:
-                above, below = linear(0.0), linear(0.0)
-                for k in range(threads):
-                    above += dots[w, 2 * k]
-                    below += dots[w, 2 * k + 1]
-                largest = linear(3.0)  # if A is not definite
-                if below > linear(0.0) and above < linear(1.0e6) * below:
-                    largest = wp.max(above / below, linear(1.0))
-                damping_out[w, level] = linear(wp.static(DAMPING)) / largest
-            wait()
-
-    @wp.kernel(
-        module="unique",
-        enable_backward=False,
-        grid_stride=False,
-        launch_bounds=SMALL_THREADS,
-        module_options=CPU_OPTIONS,
-    )
-    def cycle(
-        values: wp.array2d(dtype=H),
-        below: List,
-        tail: Tail,
-        members: List,
-        parents: List,
-        matrix: wp.array2d(dtype=M),
-        inverse: wp.array2d(dtype=M),
-        damping: wp.array2d(dtype=linear),
-        threads: int,
-        wanted: wp.array(dtype=int),
-        residual: wp.array2d(dtype=H),
-        change: wp.array2d(dtype=H),
-        z: wp.array2d(dtype=H),
-        correction: wp.array2d(dtype=H),
-    ):
-        """Restrict `values` of the level below to the small levels, and write their correction."""
-        i = wp.tid()
-        w = i / threads
-        t = i - w * threads
-        if wanted[w] != 1:
-            return
-        last = tail.bounds.shape[0] - 2
-        for level in range(last + 1):
-            first, end = int(tail.bounds[level] + t), int(tail.bounds[level + 1])
-            for k in range(first, end, threads):
-                r = H()
-                if level == 0:
-                    r = weighted_sum(below, k, values, w)
-                else:
-                    r = weighted_sum(members, k, change, w)
-                residual[w, k] = r
-                y = damping[w, level] * (inverse[w, k] * r)
-                z[w, k] = y
-                correction[w, k] = y
-            wait()
-            if level < last:
-                for k in range(first, end, threads):
-                    change[w, k] = residual[w, k] - row(tail, matrix, z, w, k)
-                wait()
-        for upper in range(last):
-            level = last - 1 - upper
-            first, end = int(tail.bounds[level] + t), int(tail.bounds[level + 1])
-            for k in range(first, end, threads):
-                z[w, k] = z[w, k] + weighted_sum(parents, k, correction, w)
-            wait()
-            for k in range(first, end, threads):
-                remaining = residual[w, k] - row(tail, matrix, z, w, k)
-                correction[w, k] = z[w, k] + damping[w, level] * (inverse[w, k] * remaining)
-            wait()
-
-    return damp, cycle
+    return restrict, subtract, correct, cycle, finish

@@ -4,14 +4,16 @@ import numpy as np
 import warp as wp
 
 import ddg_warp as ddg
+from ddg_warp import device_arrays
 from ddg_warp.kernels.linear import coupled_pcg
 from ddg_warp.scenes import gridshell_dome
+from ddg_warp.solve.linear.sparse_system import Sums
 from ddg_warp.solve.stepping import step_driver
 
 
 def test_solves_without_direction_are_flagged(device):
     """Flag r . z <= 0 or not finite at the start of a solve, and later beyond the tolerance."""
-    _, _, begin, *_, test = coupled_pcg.solver_kernels(wp.float32)
+    _, _, begin, *_, test, _ = coupled_pcg.solver_kernels(wp.float32, serial=device_arrays.serial(device))
     first = [1.0, 0.0, -1.0, np.nan, np.inf, 1.0]
 
     def upload(values, dtype=wp.float32):
@@ -24,8 +26,9 @@ def test_solves_without_direction_are_flagged(device):
     assert negative.numpy().tolist() == [0, 1, 1, 1, 1, 0]
     left = [1e-3, 1e-5, -1e-5, -1e-3, np.nan, 0.0]  # of 1; the tolerance is 1e-4
     wanted, negative = upload(1, int), upload(0, int)
-    inputs = [upload(left), upload(1.0), upload(1.0), upload(1e-2), 100]
-    wp.launch(test, 6, inputs, [upload(1.0), iterations, negative, wanted, busy], device=device)
+    inputs = [upload(1.0), upload(1.0), upload(1e-2), 100]
+    outputs = [upload(0.0), upload(1.0), upload(0.0), iterations, negative, wanted, busy]
+    Sums(6, 1, wp.float32, device).launch(test, upload(left).reshape((6, 1)), inputs, outputs)
     assert wanted.numpy().tolist() == [1, 2, 2, 3, 3, 2]
     assert negative.numpy().tolist() == [0, 0, 0, 1, 1, 0]
 

@@ -103,48 +103,71 @@ def sheet_problem(device, stretch: float = 1.02, name: str = "flat", cells: int 
 
 def prolongations(levels, blocks: int) -> list[np.ndarray]:
     """Return the dense prolongations (3 N, 3 hats) of all levels."""
-    composite, result = None, []
-    for level in levels:
-        points = len(level.parents.starts.numpy()) - 1
-        entries = (level.parents.weights.numpy(), level.parents.items.numpy(), level.parents.starts.numpy())
-        weights = csr_matrix(entries, shape=(points, level.hats)).toarray()
-        if composite is None:
-            composite = np.zeros((blocks, points))
-            composite[:points] = np.eye(points)
-        composite = composite @ weights
-        result.append(np.kron(composite, np.eye(3)))
+    nodes = len(levels.node_parents.starts.numpy()) - 1
+    nodal, upward = (
+        csr_matrix((each.weights.numpy(), each.items.numpy(), each.starts.numpy()), shape=(points, levels.hats))
+        for each, points in ((levels.node_parents, nodes), (levels.parents, levels.hats))
+    )
+    composite, result = np.zeros((blocks, levels.hats)), []
+    composite[:nodes] = nodal.toarray()
+    for count, first in zip(levels.counts, levels.bounds, strict=False):
+        result.append(np.kron(composite[:, first : first + count], np.eye(3)))
+        composite = composite @ upward.toarray()
     return result
 
 
-def level_matrix(level, world: int) -> np.ndarray:
-    """Return the dense matrix (3 hats, 3 hats) of a level."""
-    rows, columns = level.pattern.rows.numpy(), level.pattern.columns.numpy()
-    result = np.zeros((level.hats, 3, level.hats, 3))
-    result[rows, :, columns] = level.matrix.numpy()[world]
-    return result.reshape(3 * level.hats, 3 * level.hats)
+def level_matrices(levels, world: int) -> list[np.ndarray]:
+    """Return the dense matrices (3 hats, 3 hats) of all levels."""
+    matrix, hats = levels.matrix, levels.hats
+    rows, columns = matrix.rows.numpy(), matrix.columns.numpy()
+    blocks = matrix.values.numpy().reshape(9, -1, matrix.positions)[:, world].T.reshape(-1, 3, 3)
+    dense = np.zeros((hats, 3, hats, 3))
+    dense[rows[rows >= 0], :, columns[rows >= 0]] = blocks[rows >= 0]
+    ranges = [slice(first, first + count) for first, count in zip(levels.bounds, levels.counts, strict=False)]
+    return [dense[part, :, part].reshape(3 * (part.stop - part.start), -1) for part in ranges]
+
+
+def scaled_inverses(levels, world: int) -> list[np.ndarray]:
+    """Return the inverses of diagonal blocks times the damping, as dense matrices (3 hats, 3 hats) of all levels."""
+    inverse = levels.inverse.numpy().reshape(-1, levels.hats, 3, 3)[world]
+    result = []
+    for count, first in zip(levels.counts, levels.bounds, strict=False):
+        D = np.zeros((count, 3, count, 3))
+        D[np.arange(count), :, np.arange(count)] = inverse[first : first + count]
+        result.append(D.reshape(3 * count, 3 * count))
+    return result
 
 
 @pytest.mark.parametrize("name", ["flat", "cylinder"])
-def test_level_matrices_are_galerkin_products(device, name):
-    """A_l = P^T H P on free dofs, in both worlds."""
+def test_level_matrices_are_galerkin_products(device, monkeypatch, name):
+    """A_l = P^T H P on free dofs, in both worlds; additive levels and the last one have inverses of diagonal blocks."""
+    monkeypatch.setattr(multilevel, "LARGE", 0)
     problem = sheet_problem(device, name=name).iterate(0.5)
-    levels, free = problem.newton.krylov.levels.levels, problem.free()
-    assert len(levels) == 2
+    levels, free = problem.newton.krylov.levels, problem.free()
+    assert len(levels.counts) == 2
     for world in range(2):
         H = problem.matrix(world) * np.outer(free, free)
-        for level, P in zip(levels, prolongations(levels, problem.blocks), strict=True):
-            expected = P.T @ H @ P
-            matrix = level_matrix(level, world)
-            np.testing.assert_allclose(matrix, expected, rtol=0.0, atol=1e-12 * np.abs(H).max())
-            inverse = level.inverse.numpy()[world]
-            blocks = matrix.reshape(level.hats, 3, level.hats, 3)[np.arange(level.hats), :, np.arange(level.hats)]
-            np.testing.assert_allclose(inverse @ blocks, np.tile(np.eye(3), (level.hats, 1, 1)), rtol=0.0, atol=1e-9)
+        matrices = level_matrices(levels, world)
+        for P, matrix, D in zip(
+            prolongations(levels, problem.blocks), matrices, scaled_inverses(levels, world), strict=True
+        ):
+            np.testing.assert_allclose(matrix, P.T @ H @ P, rtol=0.0, atol=1e-12 * np.abs(H).max())
+            blocks = matrix * np.kron(np.eye(len(matrix) // 3), np.ones((3, 3)))
+            np.testing.assert_allclose(D @ blocks, np.eye(len(matrix)), rtol=0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("small", [1280, 30, 0], ids=["cycle", "both", "additive"])
+LEVELS = pytest.mark.parametrize(
+    ("large", "small"),
+    [(5000, 512), (5000, 60), (5000, 0), (0, 60), (0, 0)],
+    ids=["block", "half", "launches", "additive_block", "additive_launches"],
+)
+
+
+@LEVELS
 @pytest.mark.parametrize("stretch", [1.02, 0.8], ids=["tension", "compression"])
-def test_preconditioner_is_symmetric_positive_definite(device, monkeypatch, small, stretch):
-    """Also where H is indefinite, for a V-cycle over all levels, over the last one, and without it."""
+def test_preconditioner_is_symmetric_positive_definite(device, monkeypatch, large, small, stretch):
+    """Also where H is indefinite, with and without an additive level, in launches and in a block of threads."""
+    monkeypatch.setattr(multilevel, "LARGE", large)
     monkeypatch.setattr(multilevel, "SMALL", small)
     problem = sheet_problem(device, stretch, "irregular", 16)
     problem.newton.islands.inertia_coefficient.fill_(1e-3)
@@ -161,16 +184,45 @@ def test_preconditioner_is_symmetric_positive_definite(device, monkeypatch, smal
         assert np.linalg.eigvalsh(M)[0] > 0.0
 
 
+@LEVELS
+def test_preconditioner_is_the_cycle_of_its_matrices(device, monkeypatch, large, small):
+    """Compare with D_0^-1, P_1 D_1^-1 P_1^T if additive, and a symmetric V-cycle with dense matrices."""
+    monkeypatch.setattr(multilevel, "LARGE", large)
+    monkeypatch.setattr(multilevel, "SMALL", small)
+    problem = sheet_problem(device, name="irregular", cells=24).iterate(0.5)
+    newton, levels, free = problem.newton, problem.newton.krylov.levels, problem.free()
+    assert len(levels.counts) == 3 and (levels.additive > 0) == (large == 0)
+    residual = np.random.default_rng(3).normal(size=(2, 3 * problem.blocks)) * free
+    (result,) = apply_preconditioner(problem, residual[None])
+    nodal = newton.krylov.inverse.numpy().reshape(2, problem.blocks, 3, 3)
+    for world in range(2):
+        r, matrices, inverses = residual[world], level_matrices(levels, world), scaled_inverses(levels, world)
+        stages = list(zip(prolongations(levels, problem.blocks), matrices, inverses, strict=True))
+        expected = (nodal[world] @ r.reshape(-1, 3, 1)).ravel()
+        if levels.additive:
+            P, _, D = stages.pop(0)
+            expected += P @ D @ P.T @ r
+        expected += stages[0][0] @ dense_cycle(stages, stages[0][0].T @ r)
+        np.testing.assert_allclose(result[world], expected * free, rtol=0.0, atol=1e-9 * np.abs(expected).max())
+
+
+def dense_cycle(stages: list, r: np.ndarray) -> np.ndarray:
+    """Return the V-cycle over levels, each with its prolongation to nodes, its matrix, and its smoother."""
+    (P, A, D), *above = stages
+    z = D @ r
+    if not above:
+        return z
+    prolongation = np.linalg.lstsq(P, above[0][0])[0]
+    z += prolongation @ dense_cycle(above, prolongation.T @ (r - A @ z))
+    return z + D @ (r - A @ z)
+
+
 def test_smoothers_of_the_cycle_converge(device):
     """Damped block Jacobi has a spectral radius below one."""
     newton = sheet_problem(device, name="cylinder").iterate(0.5).newton
-    tail = newton.krylov.levels.tail
-    for level, damping in zip(tail.levels[:-1], tail._damping.numpy()[0], strict=False):
-        A, blocks = level_matrix(level, 0), level.inverse.numpy()[0]
-        D = np.zeros((level.hats, 3, level.hats, 3))
-        D[np.arange(level.hats), :, np.arange(level.hats)] = blocks
-        largest = np.abs(np.linalg.eigvals(D.reshape(A.shape) @ A)).max()
-        assert 1.2 < damping * largest < 1.8
+    levels = newton.krylov.levels
+    for A, D in zip(level_matrices(levels, 0)[:-1], scaled_inverses(levels, 0), strict=False):
+        assert 1.2 < np.abs(np.linalg.eigvals(D @ A)).max() < 1.8
 
 
 def test_levels_contain_contact(device):
@@ -186,12 +238,12 @@ def test_levels_contain_contact(device):
     matrices = []
     for more in (diagonal, diagonal[:0]):
         levels.prepare(newton.system, more)
-        matrices.append([level_matrix(level, 0) for level in levels.levels])
+        matrices.append(level_matrices(levels, 0))
     assert np.abs(contact).max() > 0.0
     C = np.zeros((len(contact), 3, len(contact), 3))
     C[np.arange(len(contact)), :, np.arange(len(contact))] = contact
     C = C.reshape(3 * len(contact), -1)
-    for P, together, alone in zip(prolongations(levels.levels, len(contact)), *matrices, strict=True):
+    for P, together, alone in zip(prolongations(levels, len(contact)), *matrices, strict=True):
         np.testing.assert_allclose(together - alone, P.T @ C @ P, rtol=0.0, atol=1e-12 * np.abs(together).max())
 
 

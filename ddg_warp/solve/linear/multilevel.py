@@ -5,42 +5,70 @@ import warp as wp
 
 from ddg_warp import device_arrays
 from ddg_warp.kernels.linear import multilevel
+from ddg_warp.kernels.linear.sliced_ell import SLICE
 from ddg_warp.solve.linear.hat_functions import coarse_levels
+from ddg_warp.solve.linear.sparse_system import slice_rows
 
 
 class Multilevel:
-    """Hat functions of all levels: additive (BPX) preconditioner of the large ones, V-cycle over the small ones.
+    """Hat functions of all levels: additive on the finest level of a large sheet, V-cycle over the others.
 
     Args:
         `coupled`, `table`: `CoupledModel` and its `SparseSystem`; linear: type of the linear algebra.
 
     Attributes:
-        levels: `DeviceLevel` of each level, from fine to coarse; tail: the `DeviceTail` of the small ones, if any.
+        counts: number of hats of each level, from fine to coarse.
+        bounds: first hat of each level, and the end, in the numbering of all levels; hats: that end, padding to slices included.
+        additive: hats of additive levels.
+        `members`, `parents`: weighted points of each hat, nodes or hats of the level below; weighted hats above each hat.
+        node_parents: weighted hats of each node.
+        `matrix`, `product`, `node_product`: P^T A P of all levels; A P of all levels; A P of nodes.
+        diagonal: position of the diagonal block of each hat in `matrix`; inverse: (W hats,) inverses, damped in the V-cycle.
     """
 
     def __init__(self, coupled, table, linear):
         self.coupled, self.table, self.device = coupled, table, coupled.device
-        from scipy.sparse import csr_matrix
-
-        nodes, worlds = coupled.host.nodes, coupled.worlds
+        nodes, worlds, serial = coupled.host.nodes, coupled.worlds, device_arrays.serial(coupled.device)
         levels = coarse_levels(coupled.host.rest[:nodes], _node_pattern(table, nodes))
-        self._large = sum(level.weights.shape[1] > multilevel.SMALL for level in levels)
-        small = levels[self._large :]
-        self.tail = DeviceTail(small, worlds, linear, self.device) if small else None
-        self.levels = [DeviceLevel(level, worlds, linear, self.device) for level in levels[: self._large]]
-        self.levels += self.tail.levels if small else []
-        coarsest = levels[-1].weights.shape[1] if levels else nodes
-        self._no_parents = _list(csr_matrix((coarsest, 0)), linear, self.device)
-        M = wp.types.matrix((3, 3), linear)
-        largest = max((level.product.nnz for level in levels), default=0)
-        self._product = wp.zeros(worlds * largest, dtype=M, device=self.device)
-        self._outdated = wp.zeros(worlds, dtype=int, device=self.device)
+        self.counts = [level.weights.shape[1] for level in levels]
+        self.bounds = [0, *np.cumsum([-(-count // SLICE) * SLICE for count in self.counts]).tolist()]
+        self.hats, bounds = self.bounds[-1], self.bounds
+        self.additive = bounds[1] if levels and self.counts[0] > multilevel.LARGE else 0
+        self._tail = sum(count > multilevel.SMALL for count in self.counts)  # first level in the block of threads
+        self._threads = multilevel.SMALL if self.device.is_cuda else 1
+        each = [level.weights for level in levels]
+        shape = self.hats, max(nodes, self.hats)
+        self.members = _list(_joined([weights.T for weights in each], bounds, [0, *bounds], shape), linear, self.device)
+        self.node_parents = _list(_joined(each[:1], [0], [0], (nodes, self.hats)), linear, self.device)
+        shape = self.hats, self.hats
+        self.parents = _list(_joined(each[1:], bounds, bounds[1:], shape), linear, self.device)
+        pattern = _joined([level.pattern for level in levels], bounds, bounds, shape)
+        self.matrix, diagonal, self._entries = _sliced(pattern, bounds, worlds, linear, self.device)
+        pattern = _joined([level.product for level in levels[1:]], bounds, bounds[1:], shape)
+        self.product, _, self._product_entries = _sliced(pattern, bounds, worlds, linear, self.device)
+        pattern = _joined([level.product for level in levels[:1]], [0], [0], (nodes, self.hats))
+        self.node_product, *_ = _sliced(pattern, [], worlds, linear, self.device)
+        self.diagonal = _put(diagonal, self.device)
+        H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
+        self.inverse = wp.zeros(worlds * self.hats, dtype=M, device=self.device)
+        self._residual, self._change, self._z, self._correction = (
+            wp.zeros(worlds * self.hats, dtype=H, device=self.device) for _ in range(4)
+        )
+        self._bounds = _put(bounds, self.device)
+        self._dots = wp.zeros((2, worlds * self.hats), dtype=linear, device=self.device)
+        self._sums = wp.zeros((2, worlds * len(levels) * self._threads), dtype=linear, device=self.device)
+        self._finest = multilevel.sliced_type(linear)()
+        self._finest.columns, self._finest.slices, self._finest.positions = table.columns, table.slices, table.positions
+        self._no_mask, self._no_blocks = (wp.zeros(0, dtype=dtype, device=self.device) for dtype in (wp.uint8, M))
+        self._outdated, self._first = (wp.zeros(worlds, dtype=int, device=self.device) for _ in range(2))
         self._any_outdated = wp.zeros(1, dtype=int, device=self.device)
-        self._first = wp.zeros(worlds, dtype=int, device=self.device)
-        made = multilevel.setup_kernels(linear, device_arrays.serial(self.device))
-        self._begin, self._spread, self._spread_coarse, self._contract, self._invert = made
-        self._restrict, self._correct, self._finish = multilevel.level_kernels(linear)
-        self.kernels = [*made, self._restrict, self._correct, self._finish, *(self.tail.kernels if self.tail else [])]
+        *set_up, self._damp = multilevel.setup_kernels(linear, serial)
+        self._begin, self._spread, self._contract, self._invert, self._iterate = set_up
+        self._restrict, self._subtract, self._correct, self._cycle, self._finish = multilevel.level_kernels(
+            linear, serial
+        )
+        blocks_of_threads = [(kernel, self._threads) for kernel in (self._damp, self._cycle)]
+        self.kernels = [*set_up, self._restrict, self._subtract, self._correct, self._finish, *blocks_of_threads]
 
     def prepare(self, system, more: wp.array, iteration: wp.array | None = None) -> None:
         """Set up the levels of a `LinearSystem` where H has changed.
@@ -51,145 +79,92 @@ class Multilevel:
         """
         self._any_outdated.zero_()
         inputs = [system.outdated, self._first if iteration is None else iteration]
-        self._launch(self._begin, self.coupled.worlds, inputs, [self._outdated, self._any_outdated])
+        outputs = [self._outdated, self._any_outdated]
+        wp.launch(self._begin, self.coupled.worlds, inputs, outputs, device=self.device)
         wp.capture_if(self._any_outdated, lambda: self.set_up(system.matrix, system.masks.fixed, more))
 
     def set_up(self, matrix: wp.array, fixed: wp.array, more: wp.array) -> None:
         """Compute the matrices of all levels, and the inverses of their diagonal blocks, in outdated worlds."""
-        table, coupled, below = self.table, self.coupled, None
-        for index, level in enumerate(self.levels):
-            read = [level.parents, level.product_pattern, self._outdated]
-            if below is None:
-                finest = [matrix, table.columns, table.slices, table.positions, fixed, more]
-                read = [*finest, coupled.blocks, coupled.host.nodes, *read]
-                self._sweep(self._spread, coupled.host.nodes, read, [self._product])
+        worlds, nodes, blocks, hats = self.coupled.worlds, self.coupled.host.nodes, self.coupled.blocks, self.hats
+        self._finest.values = matrix
+        for level in range(len(self.counts)):
+            if level == 0:
+                product, first, count = self.node_product, 0, self.node_product.positions
+                read = [self._finest, fixed, more, blocks, nodes, self.node_parents]
             else:
-                read = [below.matrix, below.pattern, *read]
-                self._sweep(self._spread_coarse, level.product_pattern.rows.shape[0], read, [self._product])
-            read = [self._product, level.product_pattern, level.members, level.pattern, self._outdated]
-            self._sweep(self._contract, level.pattern.rows.shape[0], read, [level.matrix])
-            read = [level.matrix, level.diagonal, level.members, int(index < self._large), self._outdated]
-            self._launch(self._invert, coupled.worlds * level.hats, read, [level.inverse])
-            below = level
-        if self.tail:
-            self.tail.damp(self._outdated)
+                product, (first, count) = self.product, _range(self._product_entries, level - 1)
+                read = [self.matrix, self._no_mask, self._no_blocks, hats, hats, self.parents]
+            self._sweep(self._spread, count, [*read, first, count, self._outdated], [product])
+            first, count = _range(self._entries, level)
+            self._sweep(self._contract, count, [product, self.members, first, count, self._outdated], [self.matrix])
+        read = [self.matrix, self.diagonal, self.members, self.additive, hats, self._outdated]
+        wp.launch(self._invert, worlds * hats, read, [self.inverse], device=self.device)
+        smoothed = [level for level, first in enumerate(self.bounds[:-2]) if first >= self.additive]
+        if smoothed:
+            first, count = self.additive, self.bounds[-2] - self.additive
+            v, next = self._z, self._change
+            for power in range(multilevel.POWER + 2):
+                read = [self.matrix, self.inverse, first, count, hats, power == 0, self._outdated, v]
+                self._sweep(self._iterate, count, read, [next, self._dots])
+                v, next = next, v
+            read = [self._bounds, smoothed[0], len(smoothed), hats, self._threads, self._dots, self._outdated]
+            self._launch_blocks(self._damp, len(smoothed), read, [self._sums, self.inverse])
 
     def apply(self, residual, inactive_mask, wanted, z: wp.array, dots: wp.array) -> None:
         """Add the corrections of coarse levels to z, which has the finest one, and write r . z block by block."""
-        if not self.levels:
+        if not self.counts:
             return
-        worlds, nodes, blocks = self.coupled.worlds, self.coupled.host.nodes, self.coupled.blocks
-        values, large = residual.reshape((worlds, blocks)), self.levels[: self._large]
-        for level in large:
-            self._launch(self._restrict, worlds * level.hats, [values, level.members, level.hats, wanted], [level.sums])
-            values = level.sums
-        above, parents = values, self._no_parents
-        if self.tail:
-            self.tail.correct(values, wanted)
-            above, parents = self.tail.levels[0].correction, self.tail.levels[0].parents
-        for level in reversed(large):
-            read = [level.inverse, level.sums, above, parents, level.hats, wanted]
-            self._launch(self._correct, worlds * level.hats, read, [level.correction])
-            above, parents = level.correction, level.parents
-        read = [residual, above, parents, inactive_mask, nodes, blocks, wanted]
-        self._launch(self._finish, worlds * blocks, read, [z, dots])
+        nodes, blocks, hats, last = self.coupled.host.nodes, self.coupled.blocks, self.hats, len(self.counts) - 1
+        values, points = residual, blocks
+        for level in range(self._tail):
+            first, count = _range(self.bounds, level)
+            read = [values, points, self.members, self.inverse, first, count, hats, wanted]
+            self._sweep(self._restrict, count, read, [self._residual, self._z])
+            values, points = self._residual, hats
+            if level < last and first >= self.additive:
+                read = [self.matrix, self._residual, self._z, first, count, hats, wanted]
+                self._sweep(self._subtract, count, read, [self._change])
+                values = self._change
+        above = self._z
+        if self._tail <= last:
+            read = [values, points, self.members, self.parents, self.matrix, self.product, self.inverse, self._bounds]
+            read += [self._tail, hats, self._threads, wanted]
+            outputs = [self._residual, self._change, self._z, self._correction]
+            self._launch_blocks(self._cycle, 1, read, outputs)
+            above = self._correction
+        for level in reversed(range(min(self._tail, last))):
+            first, count = _range(self.bounds, level)
+            read = [self.product, self.inverse, self.parents, above, self._change, self._z, first, count, hats]
+            self._sweep(self._correct, count, [*read, first >= self.additive, wanted], [self._correction])
+            above = self._correction
+        read = [residual, above, self.node_parents, inactive_mask, nodes, blocks, hats, wanted]
+        self._sweep(self._finish, blocks, read, [z, dots])
 
     def _sweep(self, kernel, count: int, inputs: list, outputs: list) -> None:
         device_arrays.sweep(kernel, self.coupled.worlds * count, inputs, outputs, self.device)
 
-    def _launch(self, kernel, dim: int, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim, inputs, outputs, device=self.device)
+    def _launch_blocks(self, kernel, count: int, inputs: list, outputs: list) -> None:
+        """Launch `count` blocks of threads in every world."""
+        threads = self.coupled.worlds * count * self._threads
+        wp.launch(kernel, threads, inputs, outputs, device=self.device, block_dim=self._threads)
 
 
-class DeviceLevel:
-    """Device arrays of a `Level`.
-
-    Attributes:
-        hats: number of hats.
-        `parents`, `members`: hats of each point of the level below, points of each hat, with weights.
-        `product_pattern`, `pattern`: patterns of A P and P^T A P; `diagonal`: entries P^T A P of one hat.
-        `matrix`, `inverse`: P^T A P, and inverses of its diagonal blocks, by world.
-        `sums`, `correction`: restricted residual, correction, by world.
-    """
-
-    def __init__(self, level, worlds: int, linear, device, arrays: list | None = None):
-        self.hats = level.weights.shape[1]
-        self.parents, self.members = (_list(each.tocsr(), linear, device) for each in (level.weights, level.weights.T))
-        self.product_pattern, self.pattern = (_pattern(each, device) for each in (level.product, level.pattern))
-        self.diagonal = _put(np.flatnonzero(_rows(level.pattern) == level.pattern.indices), device)
-        if arrays is None:
-            arrays = _arrays(level.pattern.nnz, self.hats, worlds, linear, device)
-        self.matrix, self.inverse, self.sums, self.correction = arrays
+def _range(bounds: list[int], k: int) -> tuple[int, int]:
+    """Return the first index and the number of indices of range k."""
+    return bounds[k], bounds[k + 1] - bounds[k]
 
 
-class DeviceTail:
-    """V-cycle over the small levels, one block of threads a world; see `kernels.linear.multilevel.tail_kernels`.
-
-    Attributes:
-        levels: `DeviceLevel` of each level, with views of common arrays.
-    """
-
-    def __init__(self, levels, worlds: int, linear, device):
-        H = wp.types.vector(3, linear)
-        bounds = np.cumsum([0, *(level.weights.shape[1] for level in levels)])
-        entries = np.cumsum([0, *(level.pattern.nnz for level in levels)])
-        self._worlds, self._device = worlds, wp.get_device(device)
-        self._threads = multilevel.SMALL_THREADS if self._device.is_cuda else 1
-        arrays = _arrays(entries[-1], bounds[-1], worlds, linear, device)
-        self.levels = [
-            DeviceLevel(level, worlds, linear, device, [arrays[0][:, p:q], *(each[:, a:b] for each in arrays[1:])])
-            for level, p, q, a, b in zip(
-                levels, *(each.tolist() for each in (entries, entries[1:], bounds, bounds[1:])), strict=False
-            )
-        ]
-        self._matrix, self._inverse, self._residual, self._correction = arrays
-        self._change, self._z = (wp.zeros((worlds, bounds[-1]), dtype=H, device=device) for _ in range(2))
-        self._dots = wp.zeros((worlds, 2 * self._threads), dtype=linear, device=device)
-        self._damping = wp.ones((worlds, len(levels)), dtype=linear, device=device)
-        self._tail = multilevel.Tail()
-        self._tail.bounds = _put(bounds, device)
-        starts = [level.pattern.indptr[:-1] + first for level, first in zip(levels, entries, strict=False)]
-        self._tail.starts = _put(np.append(np.concatenate(starts), entries[-1]), device)
-        columns = [level.pattern.indices + first for level, first in zip(levels, bounds, strict=False)]
-        self._tail.columns = _put(np.concatenate(columns), device)
-        upward = _shifted([level.weights for level in levels[1:]], bounds)
-        self._parents, self._members = (_list(each.tocsr(), linear, device) for each in (upward, upward.T))
-        self._damp, self._cycle = multilevel.tail_kernels(linear)
-        self.kernels = [(kernel, self._threads) for kernel in (self._damp, self._cycle)]
-
-    def damp(self, outdated: wp.array) -> None:
-        """Find the damping of the smoothers in outdated worlds."""
-        read = [self._tail, self._matrix, self._inverse, self._threads, outdated]
-        self._launch(self._damp, read, [self._change, self._z, self._dots, self._damping])
-
-    def correct(self, values: wp.array, wanted: wp.array) -> None:
-        """Write the correction of the largest small level from `values` (worlds, points) of the level below."""
-        read = [values, self.levels[0].members, self._tail, self._members, self._parents]
-        read += [self._matrix, self._inverse, self._damping, self._threads, wanted]
-        self._launch(self._cycle, read, [self._residual, self._change, self._z, self._correction])
-
-    def _launch(self, kernel, inputs: list, outputs: list) -> None:
-        threads = self._worlds * self._threads
-        wp.launch(kernel, threads, inputs, outputs, device=self._device, block_dim=self._threads)
-
-
-def _arrays(entries: int, hats: int, worlds: int, linear, device) -> list[wp.array]:
-    """Return matrix, inverses, restricted residual and correction of levels, by world."""
-    H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
-    sizes = (entries, M), (hats, M), (hats, H), (hats, H)
-    return [wp.zeros((worlds, int(count)), dtype=dtype, device=device) for count, dtype in sizes]
-
-
-def _shifted(weights: list, bounds: np.ndarray):
-    """Return the weights of levels over each other as one CSR matrix (hats, hats), in the numbering of all levels."""
+def _joined(matrices: list, rows: list[int], columns: list[int], shape: tuple[int, int]):
+    """Return a CSR matrix of blocks that begin at the given rows and columns."""
     from scipy.sparse import coo_matrix
 
-    entries = [each.tocoo() for each in weights]
-    rows = [each.row + first for each, first in zip(entries, bounds, strict=False)]
-    columns = [each.col + first for each, first in zip(entries, bounds[1:], strict=False)]
-    none, size = np.zeros(0, int), int(bounds[-1])
+    entries, none = [each.tocoo() for each in matrices], np.zeros(0, int)
+    row = np.concatenate([none, *(each.row + first for each, first in zip(entries, rows, strict=False))])
+    column = np.concatenate([none, *(each.col + first for each, first in zip(entries, columns, strict=False))])
     values = np.concatenate([np.zeros(0), *(each.data for each in entries)])
-    return coo_matrix((values, (np.concatenate([none, *rows]), np.concatenate([none, *columns]))), (size, size)).tocsr()
+    result = coo_matrix((values, (row, column)), shape=shape).tocsr()
+    result.sort_indices()
+    return result
 
 
 def _node_pattern(table, nodes: int):
@@ -204,20 +179,23 @@ def _node_pattern(table, nodes: int):
     return result
 
 
-def _rows(matrix) -> np.ndarray:
-    """Return the row of each entry of a CSR matrix."""
-    return np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
-
-
 def _put(values: np.ndarray, device) -> wp.array:
     return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
 
 
-def _pattern(matrix, device) -> multilevel.Pattern:
-    result = multilevel.Pattern()
-    result.rows, result.columns = _put(_rows(matrix), device), _put(matrix.indices, device)
-    result.starts = _put(matrix.indptr, device)
-    return result
+def _sliced(pattern, bounds: list[int], worlds: int, linear, device):
+    """Return the matrices of all worlds in sliced ELLPACK, positions of diagonal blocks, and first positions of rows `bounds`."""
+    blocks = pattern.shape[0]
+    row, column = np.repeat(np.arange(blocks), np.diff(pattern.indptr)), pattern.indices
+    slices, position = slice_rows(row, blocks)
+    rows, columns, diagonal = np.full(slices[-1], -1), np.full(slices[-1], -1), np.full(blocks, -1)
+    rows[position], columns[position] = row, column
+    diagonal[row[row == column]] = position[row == column]
+    result = multilevel.sliced_type(linear)()
+    result.rows, result.columns, result.slices = (_put(each, device) for each in (rows, columns, slices))
+    result.positions = len(rows)
+    result.values = wp.zeros((9, worlds * len(rows)), dtype=linear, device=device)
+    return result, diagonal, slices[np.array(bounds, int) // SLICE].tolist()
 
 
 def _list(matrix, linear, device):

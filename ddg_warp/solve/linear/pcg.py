@@ -69,14 +69,14 @@ class PCG:
         H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
         self.rest, self.z, self.p, self.product = (wp.zeros(count, dtype=H, device=device) for _ in range(4))
         self.inverse = wp.zeros(count, dtype=M, device=device)
-        self.rho, self.rho_first, self.total, self.curvature = (
-            wp.zeros(worlds, dtype=linear, device=device) for _ in range(4)
+        self.rho, self.rho_first, self.total, self.curvature, self.beta = (
+            wp.zeros(worlds, dtype=linear, device=device) for _ in range(5)
         )
         self.busy = wp.zeros(1, dtype=int, device=device)
         self._unread = [wp.zeros(worlds, dtype=int, device=device) for _ in range(2)]
         self.sum = Sums(worlds, coupled.blocks, linear, device)
         self._invert, self._start, self._begin, *self._cycle = coupled_pcg.solver_kernels(
-            linear, indefinite, sparsity.has_angles
+            linear, indefinite, sparsity.has_angles, device_arrays.serial(device)
         )
         self._more = contact.diagonal if contact else wp.zeros(0, dtype=M, device=device)
         self.levels = Multilevel(coupled, sparsity, linear) if multilevel else None
@@ -142,25 +142,23 @@ class PCG:
     def cycle(self, system) -> None:
         """Run one iteration."""
         blocks, inactive, wanted, dots = self.coupled.blocks, system.masks.inactive, system.wanted, system.dots
-        _, advance, turn, test = self._cycle
+        _, advance, test, turn = self._cycle
         self.multiply(system, self.p)
         self.sum(dots, self.curvature)
         self._launch(
             advance,
             [self.p, self.product, self.inverse, self.sparsity.diagonal, inactive, self.rho, self.curvature]
             + [system.iterations, wanted, blocks, self._unit],
-            [system.direction, self.rest, self.z, dots, self.busy],
+            [system.direction, self.rest, self.z, dots, self.beta, self.busy],
         )
         self.precondition(system, self.z)
-        self.sum(dots, self.total)
-        self._launch(turn, [self.z, self.total, self.rho, inactive, wanted, blocks], [self.p])
-        wp.launch(
+        self.sum.launch(
             test,
-            self.coupled.worlds,
-            [self.total, self.curvature, self.rho_first, system.forcing, self._limit],
-            [self.rho, system.iterations, system.indefinite, wanted, self.busy],
-            device=self.coupled.device,
+            dots,
+            [self.curvature, self.rho_first, system.forcing, self._limit],
+            [self.total, self.rho, self.beta, system.iterations, system.indefinite, wanted, self.busy],
         )
+        self._launch(turn, [self.z, self.beta, inactive, blocks], [self.p])
 
     @timer("product")
     def multiply(self, system, p: wp.array) -> None:

@@ -44,12 +44,7 @@ class SparseSystem:
         inverse = np.empty(len(order), int)
         inverse[order] = np.cumsum(first) - 1
         row, column = row[first], column[first]
-        counts = np.bincount(row, minlength=blocks)
-        padded = np.zeros(-(-blocks // SLICE) * SLICE, int)
-        padded[:blocks] = counts
-        slices = np.concatenate([[0], np.cumsum(padded.reshape(-1, SLICE).max(1) * SLICE)])
-        rank = np.arange(len(row)) - (np.cumsum(counts) - counts)[row]
-        position = slices[row // SLICE] + rank * SLICE + row % SLICE
+        slices, position = slice_rows(row, blocks)
         self.positions = int(slices[-1])
         if self.positions * coupled.worlds >= 2**31:
             raise SceneError(
@@ -73,6 +68,16 @@ class SparseSystem:
             starts, items = lists(element_set.host.slots.T.ravel(), blocks)
             element, local = np.divmod(items, len(element_set.host.slots))
             self.meets.append((put(starts), put(element * ITEM + local)))
+
+
+def slice_rows(row: np.ndarray, blocks: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the offsets of slices, and the positions of entries that are sorted by their `row`, of a matrix of `blocks` rows."""
+    counts = np.bincount(row, minlength=blocks)
+    padded = np.zeros(-(-blocks // SLICE) * SLICE, int)
+    padded[:blocks] = counts
+    slices = np.concatenate([[0], np.cumsum(padded.reshape(-1, SLICE).max(1) * SLICE)])
+    rank = np.arange(len(row)) - (np.cumsum(counts) - counts)[row]
+    return slices, slices[row // SLICE] + rank * SLICE + row % SLICE
 
 
 def _pairs(element_set, kept, out) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
@@ -114,28 +119,24 @@ class Sums:
     """
 
     def __init__(self, worlds: int, n: int, real, device, largest: bool = False):
-        tiles = -(-n // coupled_pcg.TILE)
-        if tiles > coupled_pcg.TILES:
-            raise SceneError(
-                f"the coupled system has {n} dof blocks or edges; the limit is {coupled_pcg.TILE * coupled_pcg.TILES}"
-            )
-        self.worlds, self.tiles, self.device = worlds, tiles, wp.get_device(device)
-        cuda = self.device.is_cuda
-        self._own = coupled_pcg.sum_kernels(real, largest) if cuda else (coupled_pcg.serial_sum_kernel(real, largest),)
-        self.kernels = [(kernel, coupled_pcg.THREADS) for kernel in self._own]
-        self._partial = wp.zeros((worlds, tiles), dtype=real, device=device)
+        self.device = wp.get_device(device)
+        serial = device_arrays.serial(device)
+        self._tiles = max(1, -(-n // coupled_pcg.TILE))
+        self._threads = worlds if serial else worlds * self._tiles * coupled_pcg.THREADS
+        self._partial = wp.zeros(worlds * self._tiles, dtype=real, device=device)
+        self._counts = wp.zeros(worlds, dtype=int, device=device)
+        self._total = coupled_pcg.sum_kernel(real, largest, serial)
+        self.kernels = [(self._total, coupled_pcg.THREADS)]
 
-    @timer("reductions")
     def __call__(self, values: wp.array, out: wp.array) -> None:
         """Write the sums to `out` (worlds,)."""
-        if not self.device.is_cuda:
-            wp.launch(self._own[0], self.worlds, [values, out], device=self.device)
-            return
-        for kernel, grid, inputs in (
-            (self._own[0], (self.worlds, self.tiles), [values, self._partial]),
-            (self._own[1], (self.worlds,), [self._partial, out]),
-        ):
-            wp.launch_tiled(kernel, dim=grid, inputs=inputs, block_dim=coupled_pcg.THREADS, device=self.device)
+        self.launch(self._total, values, [], [out])
+
+    @timer("reductions")
+    def launch(self, kernel, values: wp.array, inputs: list, outputs: list) -> None:
+        """Launch a kernel that sums values by `coupled_pcg.reduce_function`."""
+        inputs = [values, self._tiles, self._partial, self._counts, *inputs]
+        wp.launch(kernel, self._threads, inputs, outputs, device=self.device, block_dim=coupled_pcg.THREADS)
 
 
 class MatrixAssembly:
