@@ -22,7 +22,7 @@ class Multilevel:
         additive: hats of additive levels.
         `members`, `parents`: weighted points of each hat, nodes or hats of the level below; weighted hats above each hat.
         node_parents: weighted hats of each node.
-        `matrix`, `product`, `node_product`: P^T A P of all levels; A P of all levels; A P of nodes.
+        `matrix`, `product`, `node_product`: P^T A P of all levels, A P of all levels, A P of nodes.
         diagonal: position of the diagonal block of each hat in `matrix`; inverse: (W hats,) inverses, damped in the V-cycle.
     """
 
@@ -33,8 +33,10 @@ class Multilevel:
         self.counts = [level.weights.shape[1] for level in levels]
         self.bounds = [0, *np.cumsum([-(-count // SLICE) * SLICE for count in self.counts]).tolist()]
         self.hats, bounds = self.bounds[-1], self.bounds
-        self.additive = bounds[1] if levels and self.counts[0] > multilevel.LARGE else 0
-        self._tail = sum(count > multilevel.SMALL for count in self.counts)  # first level in the block of threads
+        additive = int(max(self.counts[:1], default=0) > multilevel.LARGE[self.device.is_cuda])
+        self.additive = bounds[additive]
+        # first level in the block of threads
+        self._tail = max(additive, sum(count > multilevel.SMALL for count in self.counts))
         self._threads = multilevel.SMALL if self.device.is_cuda else 1
         each = [level.weights for level in levels]
         shape = self.hats, max(nodes, self.hats)
@@ -43,11 +45,11 @@ class Multilevel:
         shape = self.hats, self.hats
         self.parents = _list(_joined(each[1:], bounds, bounds[1:], shape), linear, self.device)
         pattern = _joined([level.pattern for level in levels], bounds, bounds, shape)
-        self.matrix, diagonal, self._entries = _sliced(pattern, bounds, worlds, linear, self.device)
+        self.matrix, diagonal = _sliced(pattern, worlds, linear, self.device)
         pattern = _joined([level.product for level in levels[1:]], bounds, bounds[1:], shape)
-        self.product, _, self._product_entries = _sliced(pattern, bounds, worlds, linear, self.device)
+        self.product, _ = _sliced(pattern, worlds, linear, self.device)
         pattern = _joined([level.product for level in levels[:1]], [0], [0], (nodes, self.hats))
-        self.node_product, *_ = _sliced(pattern, [], worlds, linear, self.device)
+        self.node_product, _ = _sliced(pattern, worlds, linear, self.device)
         self.diagonal = _put(diagonal, self.device)
         H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
         self.inverse = wp.zeros(worlds * self.hats, dtype=M, device=self.device)
@@ -87,16 +89,14 @@ class Multilevel:
         """Compute the matrices of all levels, and the inverses of their diagonal blocks, in outdated worlds."""
         worlds, nodes, blocks, hats = self.coupled.worlds, self.coupled.host.nodes, self.coupled.blocks, self.hats
         self._finest.values = matrix
+        product, rows = self.node_product, (0, nodes)
+        read = [self._finest, fixed, more, blocks, nodes, self.node_parents]
         for level in range(len(self.counts)):
-            if level == 0:
-                product, first, count = self.node_product, 0, self.node_product.positions
-                read = [self._finest, fixed, more, blocks, nodes, self.node_parents]
-            else:
-                product, (first, count) = self.product, _range(self._product_entries, level - 1)
-                read = [self.matrix, self._no_mask, self._no_blocks, hats, hats, self.parents]
-            self._sweep(self._spread, count, [*read, first, count, self._outdated], [product])
-            first, count = _range(self._entries, level)
-            self._sweep(self._contract, count, [product, self.members, first, count, self._outdated], [self.matrix])
+            self._sweep(self._spread, rows[1], [*read, *rows, self._outdated], [product])
+            rows = _range(self.bounds, level)
+            self._sweep(self._contract, rows[1], [product, self.members, *rows, self._outdated], [self.matrix])
+            product = self.product
+            read = [self.matrix, self._no_mask, self._no_blocks, hats, hats, self.parents]
         read = [self.matrix, self.diagonal, self.members, self.additive, hats, self._outdated]
         wp.launch(self._invert, worlds * hats, read, [self.inverse], device=self.device)
         smoothed = [level for level, first in enumerate(self.bounds[:-2]) if first >= self.additive]
@@ -183,19 +183,18 @@ def _put(values: np.ndarray, device) -> wp.array:
     return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
 
 
-def _sliced(pattern, bounds: list[int], worlds: int, linear, device):
-    """Return the matrices of all worlds in sliced ELLPACK, positions of diagonal blocks, and first positions of rows `bounds`."""
+def _sliced(pattern, worlds: int, linear, device):
+    """Return the matrices of all worlds in sliced ELLPACK, and the positions of diagonal blocks."""
     blocks = pattern.shape[0]
     row, column = np.repeat(np.arange(blocks), np.diff(pattern.indptr)), pattern.indices
     slices, position = slice_rows(row, blocks)
-    rows, columns, diagonal = np.full(slices[-1], -1), np.full(slices[-1], -1), np.full(blocks, -1)
-    rows[position], columns[position] = row, column
+    columns, diagonal = np.full(slices[-1], -1), np.full(blocks, -1)
+    columns[position] = column
     diagonal[row[row == column]] = position[row == column]
     result = multilevel.sliced_type(linear)()
-    result.rows, result.columns, result.slices = (_put(each, device) for each in (rows, columns, slices))
-    result.positions = len(rows)
-    result.values = wp.zeros((9, worlds * len(rows)), dtype=linear, device=device)
-    return result, diagonal, slices[np.array(bounds, int) // SLICE].tolist()
+    result.columns, result.slices, result.positions = _put(columns, device), _put(slices, device), len(columns)
+    result.values = wp.zeros((9, worlds * len(columns)), dtype=linear, device=device)
+    return result, diagonal
 
 
 def _list(matrix, linear, device):
