@@ -17,7 +17,7 @@ Hats of all levels have one numbering, from fine to coarse. Let P be the prolong
 correction e of level l + 1 changes the residual r - A_l z to r - A_l z - B e: one more product a level. Each of these steps is a
 launch, as one block of threads reads a matrix slowly. The last levels are in one block, as launches would take longer there.
 
-Measured: a sheet of 512 x 512 takes 39 iterations a step of 1/240 s, and one of 256 x 256 takes 33; with V-cycles from 1,089 hats on
+Measured: a sheet of 512 x 512 takes 38 iterations a step of 1/240 s, and one of 256 x 256 takes 32; with V-cycles from 1,089 hats on
 51 and 35, and without 72 and 48. Groups of nodes that translate as one piece take 875 and 430: a jump costs the size of the group over
 the mesh width times the energy of a smooth displacement. On a CPU core a sheet of 70 x 70 takes a tenth fewer iterations with its
 finest level in the V-cycle, and an eighth more time.
@@ -28,9 +28,10 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.core.division import nonzero_function
-from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function, wait
+from ddg_warp.kernels.core.launch import CPU_OPTIONS, TWO_BLOCKS, until_function, wait
 from ddg_warp.kernels.linear.sliced_ell import SLICE, product_functions
 
+BATCH = 6  # entries of a row whose loads a thread has under way together on CUDA
 SMALL = 512  # hats up to which a level has no launches of its own; threads of the block of such levels
 LARGE = {False: 0, True: 5000}  # hats up to which the finest level is in the V-cycle, without and with CUDA
 POWER = 8  # power iterations for the largest eigenvalue of D^-1 A
@@ -65,9 +66,16 @@ def sliced_type(linear):
 
 
 @cache
-def weighted_sum_function(linear):
-    """Return the device function `weighted_sum(list, k, values, shift)`: weighted sum of the values of list k, from `shift` on."""
-    H = wp.types.vector(3, linear)
+def row_functions(linear, serial: bool):
+    """Return device functions for sums over a list or a row, of which rows are in batches unless `serial`.
+
+    `weighted_sum(list, k, values, shift)`: weighted sum of the values of list k, from `shift` on.
+    `product_of(matrix, v, k, w, hats)`: row k of A v in world w.
+
+    Measured: without batches a row of 25 entries takes about 40 us if an H100 has to load the matrix. A thread then waits for the
+    column, and after it for the vector, in each entry.
+    """
+    H, Sliced, batch = wp.types.vector(3, linear), sliced_type(linear), 1 if serial else BATCH
 
     @wp.func
     def weighted_sum(list: list_type(linear), k: int, values: wp.array(dtype=H), shift: int):
@@ -76,7 +84,25 @@ def weighted_sum_function(linear):
             total += list.weights[index] * values[list.items[index] + shift]
         return total
 
-    return weighted_sum
+    @wp.func
+    def product_of(matrix: Sliced, v: wp.array(dtype=H), k: int, w: int, hats: int):
+        slice = k / wp.static(SLICE)
+        start, end = matrix.slices[slice] + k - slice * wp.static(SLICE), matrix.slices[slice + 1]
+        shift = w * matrix.positions
+        y = H()
+        for first in range(start, end, wp.static(batch * SLICE)):
+            for index in range(wp.static(batch)):
+                p, c = first + index * wp.static(SLICE), linear(1.0)
+                if wp.static(batch > 1):  # a factor, not a branch, lets the loads of a batch go together
+                    c = wp.where(p < end, linear(1.0), linear(0.0))
+                    p = wp.where(p < end, p, first)
+                x = c * v[wp.max(matrix.columns[p], 0) + w * hats]  # entries of the padding are zero
+                for a in range(3):
+                    for b in range(3):
+                        y[a] = y[a] + matrix.values[3 * a + b, p + shift] * x[b]
+        return y
+
+    return weighted_sum, product_of
 
 
 @cache
@@ -92,7 +118,8 @@ def setup_kernels(linear, serial: bool):
     """
     H, M, until = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear), until_function(serial)
     List, Sliced = list_type(linear), sliced_type(linear)
-    times, free = product_functions(linear)
+    _, free = product_functions(linear)
+    _, product_of = row_functions(linear, serial)
     nonzero = nonzero_function(linear)
 
     @wp.func
@@ -164,8 +191,8 @@ def setup_kernels(linear, serial: bool):
             clear(product, begin, product.slices[slice + 1], shift)
             for p in range(first_of(matrix, i), matrix.slices[slice + 1], wp.static(SLICE)):
                 j = matrix.columns[p]
-                if j < 0 or j >= points:
-                    continue
+                if j < 0 or j >= points:  # columns are sorted, and followed by padding
+                    break
                 block = block_of(matrix.values, p + w * matrix.positions)
                 if i == j and more.shape[0] > 0:
                     block += more[i + w * blocks]
@@ -231,7 +258,9 @@ def setup_kernels(linear, serial: bool):
             inverse = wp.diag(wp.cw_mul(s, s))
         inverse_out[i] = inverse
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    @wp.kernel(
+        module="unique", launch_bounds=TWO_BLOCKS, enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS
+    )
     def iterate(
         matrix: Sliced,
         inverse: wp.array(dtype=M),
@@ -258,9 +287,7 @@ def setup_kernels(linear, serial: bool):
                     y[d] = linear((k * 7919 + d * 4099) % 13 - 6)
                 next_out[i] = y
             else:
-                product = times(
-                    matrix.values, matrix.columns, matrix.slices, v, k, w * matrix.positions, w * hats, hats, hats
-                )
+                product = product_of(matrix, v, k, w, hats)
                 y = inverse[i] * product
                 next_out[i] = y
                 dots_out[0, i] = wp.dot(product, y)
@@ -322,12 +349,8 @@ def level_kernels(linear, serial: bool):
     """
     H, M, until = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear), until_function(serial)
     List, Sliced = list_type(linear), sliced_type(linear)
-    times, free = product_functions(linear)
-    weighted_sum = weighted_sum_function(linear)
-
-    @wp.func
-    def product_of(matrix: Sliced, v: wp.array(dtype=H), k: int, w: int, hats: int):
-        return times(matrix.values, matrix.columns, matrix.slices, v, k, w * matrix.positions, w * hats, hats, hats)
+    _, free = product_functions(linear)
+    weighted_sum, product_of = row_functions(linear, serial)
 
     @wp.func
     def corrected(
@@ -345,7 +368,9 @@ def level_kernels(linear, serial: bool):
         remaining = change[i] - product_of(product, above, k, w, hats)
         return z[i] + weighted_sum(parents, k, above, w * hats) + inverse[i] * remaining
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    @wp.kernel(
+        module="unique", launch_bounds=TWO_BLOCKS, enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS
+    )
     def restrict(
         values: wp.array(dtype=H),
         points: int,
@@ -369,7 +394,9 @@ def level_kernels(linear, serial: bool):
                 residual_out[i] = r
                 z_out[i] = inverse[i] * r
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    @wp.kernel(
+        module="unique", launch_bounds=TWO_BLOCKS, enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS
+    )
     def subtract(
         matrix: Sliced,
         residual: wp.array(dtype=H),
@@ -388,7 +415,9 @@ def level_kernels(linear, serial: bool):
                 k = first + t - w * count
                 change_out[k + w * hats] = residual[k + w * hats] - product_of(matrix, z, k, w, hats)
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    @wp.kernel(
+        module="unique", launch_bounds=TWO_BLOCKS, enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS
+    )
     def correct(
         product: Sliced,
         inverse: wp.array(dtype=M),
@@ -416,7 +445,7 @@ def level_kernels(linear, serial: bool):
                     correction_out[i] = z[i] + weighted_sum(parents, k, above, w * hats)
 
     @wp.kernel(
-        module="unique", enable_backward=False, grid_stride=False, launch_bounds=SMALL, module_options=CPU_OPTIONS
+        module="unique", enable_backward=False, grid_stride=False, launch_bounds=(SMALL, 1), module_options=CPU_OPTIONS
     )
     def cycle(
         values: wp.array(dtype=H),
