@@ -6,8 +6,8 @@ from pathlib import Path
 
 from ddg_warp.errors import SceneError, SolverError
 
-# Least bytes of a node of uncoupled rods, constant arrays, states and solver together: planar, without twist, and with twist. They are
-# those of rods that only stretch, and of straight rods with twist; see `postprocess.model_report.bytes_per_node`.
+# Least bytes of a node of uncoupled rods, constant arrays, states and solver together: planar, without twist, and with twist. The least
+# have rods that only stretch, or with twist straight rods; see `postprocess.model_report.bytes_per_node`.
 ROD_NODE = {"float64": (260, 400, 810), "mixed": (225, 335, 660), "float32": (130, 200, 400)}
 # Least bytes of a dof block of the coupled system in float64. Measured: 1340 (joined rods) to 3360 (contact).
 COUPLED = 1300

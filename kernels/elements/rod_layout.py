@@ -299,7 +299,7 @@ def _term_access(kind: RodKind, index: int, real, prepared: bool) -> TermAccess:
 def rod_storage(kind: RodKind, real, prepared: bool = False) -> ElementStorage:
     """Return the storage of uncoupled rods: an island is a rod, and all terms have one window.
 
-    If `prepared`, lagged data are those of `Measure.prepared`, and no function reads them.
+    If `prepared`, lagged data are the data of `Measure.prepared`, and no function reads them.
     """
     Inputs, missing, closed, rod_major = (
         rod_elements_type(kind.dim, real),

@@ -23,7 +23,7 @@ and its derivative adds to that of `bending_second_variation`: 2 (tt . (v + u)) 
 
 Lagged data: u_e (3), t_e (3), u_f (3), t_f (3), m_ref (1).
 
-Two vertices share the frame of the edge between them. Evaluations along a rod prepare it once: see `prepared`.
+The edge between two vertices has one frame, which evaluations along a rod prepare once; see `prepared`.
 """
 
 from functools import cache
@@ -262,7 +262,7 @@ def _prepared(real):
 
     @wp.func
     def stale(q: Q, s: S):
-        """Return what `_stale` does; see `parallel_transport.stale_function`."""
+        """Return True if reference frames must be updated before the next step; see `parallel_transport.stale_function`."""
         if s[13] >= real(0.9) and s[27] >= real(0.9):
             return False
         te = V(s[0], s[1], s[2])

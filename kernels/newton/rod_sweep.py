@@ -448,11 +448,11 @@ def decide_function(kind: RodKind, real, linear, exact: bool, fails: bool):
 
 @cache
 def substitute_function(kind: RodKind, real, linear, mixed_axial: bool, sides: int):
-    """Return the struct `Ahead` and the device function `substitute` of some nodes of a rod, in order.
+    """Return the struct `NextNode` and the device function `substitute` of some nodes of a rod, in order.
 
-    `Ahead` has the steps of the two nodes before, the position of the nearer one before its step, and the largest squared rotation of
-    an edge so far. `substitute(..., start, stride, number, started, ahead)` solves for `number` nodes start, start + stride, ...,
-    and moves them; `ahead` has a node if `started`.
+    `NextNode` has the steps of the two nodes before, the position of the nearer one before its step, and the largest squared rotation
+    of an edge so far. `substitute(..., start, stride, number, started, next_node)` solves for `number` nodes start, start + stride,
+    ..., and moves them; `next_node` has a node if `started`.
     """
     Data = data_type(kind, real, linear)
     dim, nb, twist, span, nb2, angle = kind.dim, kind.block, kind.twist, kind.span, kind.block**2, kind.block - 1
@@ -465,7 +465,7 @@ def substitute_function(kind: RodKind, real, linear, mixed_axial: bool, sides: i
     _, _, vector, store_vector = block_functions(nb, linear)
 
     @wp.struct
-    class Ahead:
+    class NextNode:
         e1: H
         e2: H
         x: V
@@ -480,12 +480,12 @@ def substitute_function(kind: RodKind, real, linear, mixed_axial: bool, sides: i
         stride: int,
         number: int,
         started: bool,
-        ahead: Ahead,
+        next_node: NextNode,
     ):
-        e1 = ahead.e1
-        e2 = ahead.e2
-        x_ahead = ahead.x
-        rotation = ahead.rotation
+        e1 = next_node.e1
+        e2 = next_node.e2
+        x_ahead = next_node.x
+        rotation = next_node.rotation
         if wp.static(mixed_axial):
             next_axial_force = linear(0.0)
             axial_force = linear(0.0)
@@ -541,14 +541,14 @@ def substitute_function(kind: RodKind, real, linear, mixed_axial: bool, sides: i
             y = y_before
             x_j = x_before
             twist_angle = twist_angle_before
-        out = Ahead()
+        out = NextNode()
         out.e1 = e1
         out.e2 = e2
         out.x = x_ahead
         out.rotation = rotation
         return out
 
-    return Ahead, substitute
+    return NextNode, substitute
 
 
 @cache
@@ -567,7 +567,7 @@ def sweep_kernel(
     balanced, _ = line_search_functions(kind.twist, real)
     Data, Front, eliminate = eliminate_function(kind, real, linear, exact_from, mixed_axial, 1)
     decide = decide_function(kind, real, linear, exact_from is not None, fails)
-    Ahead, substitute = substitute_function(kind, real, linear, mixed_axial, 1)
+    NextNode, substitute = substitute_function(kind, real, linear, mixed_axial, 1)
     take = take_function(real)
 
     # Measured: spilling registers beyond 255 to shared memory gains 8 % on an H200; with tensions it costs 12 %.
@@ -607,8 +607,8 @@ def sweep_kernel(
             r,
         ):
             return
-        ahead = substitute(data, scalars, r, n - 1, -1, n, False, Ahead())
-        take(flags, scalars, ahead.rotation, rotation_cap, r)
+        next_node = substitute(data, scalars, r, n - 1, -1, n, False, NextNode())
+        take(flags, scalars, next_node.rotation, rotation_cap, r)
 
     return sweep
 
@@ -625,7 +625,7 @@ def two_sided_kernels(kind: RodKind, real, linear, exact_from: int | None = None
     rests = converged_function(real)
     Data, Front, eliminate = eliminate_function(kind, real, linear, exact_from, False, 2)
     decide = decide_function(kind, real, linear, exact_from is not None, fails)
-    Ahead, substitute = substitute_function(kind, real, linear, False, 2)
+    NextNode, substitute = substitute_function(kind, real, linear, False, 2)
     nb, nb2, V = kind.block, kind.block**2, wp.types.vector(kind.dim, real)
     load, store, vector, store_vector = block_functions(nb, linear)
     worst_row = 3 * nb2 + 2 * nb
@@ -705,8 +705,8 @@ def two_sided_kernels(kind: RodKind, real, linear, exact_from: int | None = None
         flags[NEEDS_DIRECTION, r] = 1
         base[h - 1, r] = data.x[h - 1, r]
         base[h, r] = data.x[h, r]
-        ahead = substitute(data, scalars, r, h, -1, 2, False, Ahead())
-        sums[0, r] = ahead.rotation
+        next_node = substitute(data, scalars, r, h, -1, 2, False, NextNode())
+        sums[0, r] = next_node.rotation
         sums[1, r] = real(0.0)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, launch_bounds=128, module_options=CPU_OPTIONS)
@@ -722,15 +722,15 @@ def two_sided_kernels(kind: RodKind, real, linear, exact_from: int | None = None
             return
         n = data.count[r]
         nearer = n / 2 - 1 + side
-        ahead = Ahead()
-        ahead.e1 = vector(data.direction, 0, nearer, r)
-        ahead.e2 = vector(data.direction, 0, n / 2 - side, r)
-        ahead.x = base[nearer, r]
-        ahead.rotation = sums[side, r]
+        next_node = NextNode()
+        next_node.e1 = vector(data.direction, 0, nearer, r)
+        next_node.e2 = vector(data.direction, 0, n / 2 - side, r)
+        next_node.x = base[nearer, r]
+        next_node.rotation = sums[side, r]
         stride = 2 * side - 1
         number = share(n, side)
         if number > 0:
-            out = substitute(data, scalars, r, nearer + stride, stride, number, True, ahead)
+            out = substitute(data, scalars, r, nearer + stride, stride, number, True, next_node)
             sums[side, r] = out.rotation
 
     return inward, middle, outward

@@ -7,10 +7,9 @@ forces on the first nodes. A rod has converged if at every free dof
 
     |residual| <= max(rtol * load scale, floor) ,   floor = floor_factor * eps * (H_ii |x| + sum of |element forces|) ,
 
-where the floor bounds the rounding of coordinates and forces, and |x| is the largest coordinate of the node and of the next one, whose
-edge is as exact as that. Moments are compared over the length of the rod. Sums of residuals have to be small, too; see
-`compile.residual_tolerance`. After a full Newton step they are, of second order. At the start, or after a shortened step, the limit is
-divided by the number of nodes instead.
+where the floor bounds the rounding of coordinates and forces. |x| is the largest coordinate of the node and of the next one. Moments
+are compared over the length of the rod. Sums of residuals have to be small, too; see `compile.residual_tolerance`. After a full Newton
+step they are, of second order. At the start, or after a shortened step, the limit is divided by the number of nodes instead.
 """
 
 from functools import cache
@@ -111,7 +110,7 @@ def evaluate_kernel(
         edge, *_ = kind.prepared(real)
     element_at, angle = element_function(storage, real, linear, curved, mixed_axial), dim * span
 
-    # Data that an element does not share with the element before.
+    # Data of an element that the element before it lacks.
     @wp.struct
     class Stencil:
         x: V  # of the node after next
@@ -196,7 +195,7 @@ def evaluate_kernel(
         # of the edge behind: its force dE/de, and the largest stiffness of its element
         force_behind = V()
         stiff_behind = real(0.0)
-        # of the element behind: its derivatives by the edge and the twist angle ahead
+        # of the element behind: derivatives by the next edge and its twist angle
         force_ahead = V()
         moment_ahead = real(0.0)
         start = first - wp.static(span)
@@ -213,20 +212,20 @@ def evaluate_kernel(
         next_position = inputs.x[index_of(start, n), r]
         theta = real(0.0)
         near = P()
-        ahead = Stencil()
+        next_stencil = Stencil()
         if wp.static(not serial):
-            ahead = stencil_at(inputs, start - 1, n, r)
+            next_stencil = stencil_at(inputs, start - 1, n, r)
         for j in range(start - 1, wp.min(first + run, n)):
             owned = j >= first
             r = wp.max(renewed(rod), 0)
             k = index_of(j, n)
             column = column_of(inputs, r, wp.min(k, count_of(inputs, r) - 1))
-            stencil = ahead
+            stencil = next_stencil
             read = stencil_at(inputs, j + wp.static(0 if serial else 1), n, r)
             if wp.static(serial):
                 stencil = read
             else:
-                ahead = read
+                next_stencil = read
             inertia = mass[k, r]
             goal = target[k, r]
             step = H()

@@ -135,7 +135,7 @@ class Problem:
         return (bits & 1 == 0).ravel()
 
     def dense(self, column: int, q: np.ndarray):
-        """Return Gauss-Newton matrix and residual of a rod at its last evaluated iterate q, from factors and gradients there."""
+        """Return Gauss-Newton matrix and residual of a rod at the last evaluated iterate, from factors and gradients."""
         kind, n = self.kind, self.count[column]
         F, g = self.factor, self.gradient
         diagonal, target, force = self.inertia(column)
@@ -205,8 +205,8 @@ def test_sweep_equals_a_dense_solve(device, name, precision):
 
 
 @pytest.mark.parametrize(("name", "psd"), [*((name, "gauss_newton") for name in KINDS), ("full", "none")])
-def test_elements_are_those_evaluated_alone(device, name, psd):
-    """Factors, second derivatives, energies and stiffnesses of runs of elements equal those of single elements, frames included."""
+def test_elements_of_runs_equal_single_elements(device, name, psd):
+    """Compare factors, second derivatives, energies and stiffnesses of runs of elements with single elements."""
     problem = Problem(name, device, psd=psd)
     newton, kind, real = problem.newton, problem.kind, problem.newton.real
     newton.islands.drop_compression.fill_(0)

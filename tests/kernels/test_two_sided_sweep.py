@@ -53,7 +53,7 @@ def solvers(kind, name: str, device, precision: str, compress: float = 1.0, **op
                 scene.fix(rod, [node], components=components)
         if name == "full":
             scene.fix_twist(rod, [int(random.integers(nodes - 1))])
-    model, found = scene.build(device, precision), []
+    model, solvers = scene.build(device, precision), []
     for group, state in zip(model.groups, model.state().groups, strict=True):
         newton = kind(model, group, NewtonOptions(**options))
         x = device_arrays.download(state.x)
@@ -66,12 +66,12 @@ def solvers(kind, name: str, device, precision: str, compress: float = 1.0, **op
         newton.islands.inverse_step.fill_(1.0)
         newton.last = state.last
         newton.iterate(state.last)
-        found.append(newton)
-    return found
+        solvers.append(newton)
+    return solvers
 
 
 def results(newton: RodNewton) -> dict[str, np.ndarray]:
-    """Return what an iteration wrote, without entries past the ends of rods."""
+    """Return the dofs, directions and flags of an iteration, without entries past the ends of rods."""
     exists = np.arange(newton.group.nodes)[:, None] < newton.group.host.count
     arrays = {"x": newton.iterates.x, "direction": newton.direction}
     if newton.group.kind.twist:

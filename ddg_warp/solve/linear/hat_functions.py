@@ -40,9 +40,11 @@ def coarse_levels(points: np.ndarray, pattern) -> list[Level]:
     no entry of the matrix joins has one hat for each of them: layers near each other stay independent. Points whose neighbours are far
     apart, compared with the spacing, are carried to the next level. So graded meshes are coarsened from the finest cells on.
 
-    Alternative: quadratic B-splines on levels over 50,000 hats, without the kinks of trilinear hats, which cost bending energy.
-    Measured: a sheet of 512 x 512 takes 33 iterations a step instead of 38, but 9.1 ms instead of 4.3 at rtol 0.1 on an H100, since
-    their matrices have 49 blocks a row, not 25, and take longer to set up.
+    Alternative: quadratic B-splines on levels over 50,000 hats, without the kinks of trilinear hats, which cost bending energy. Their
+    matrices have 49 blocks a row, not 25.
+
+    Measured: by B-splines a sheet of 512 x 512 takes 33 iterations a step instead of 38. A step at rtol 0.1 takes 9.1 ms on an H100
+    instead of 4.3, most of it for the set-up.
     """
     from scipy.sparse import identity
 

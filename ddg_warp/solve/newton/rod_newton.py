@@ -130,7 +130,7 @@ class RodNewton:
         self._prepare_sweep(mixed_axial)
 
     def _sides(self, mixed_axial: bool) -> int:
-        """Return the number of ends of a rod from which a sweep eliminates at once."""
+        """Return the number of ends of a rod where a sweep starts."""
         return 1 if mixed_axial else swept_ends(self.group)
 
     def _prepare_sweep(self, mixed_axial: bool) -> None:
@@ -305,12 +305,12 @@ def has_natural_curvature(group) -> bool:
 
 
 def swept_ends(group) -> int:
-    """Return the number of ends of a rod from which a sweep eliminates at once: few rods give too few threads otherwise."""
+    """Return the number of ends of a rod where a sweep starts: two for few rods on a GPU, which give too few threads otherwise."""
     return 1 if group.kind.serial or group.columns > FEW else 2
 
 
 def _run(group) -> int:
-    """Return the nodes that a thread evaluates: all on the CPU, on a GPU those with which all threads end first.
+    """Return the nodes that a thread evaluates: all on the CPU, on a GPU the number with which all threads end first.
 
     Threads run in waves, and each also evaluates the elements before its run.
     """

@@ -84,7 +84,7 @@ class RodElements:
 
     @classmethod
     def of(cls, group, real, linear, exact: bool, mixed_axial: bool, rows: int) -> "RodElements":
-        """Return zeros, with room for second derivatives if `exact`, and for `rows` at least in the place of factors."""
+        """Return zeros, with room for second derivatives if `exact`, and for `rows` at least where factors are."""
         kind, nodes = group.kind, (group.nodes, group.columns)
         second = (kind.geometric_rows, *nodes) if exact else (1, 1, 1)
         shapes = (max(kind.factor_rows + mixed_axial, rows), *nodes), second, (2, *nodes), nodes
