@@ -39,6 +39,9 @@ class DecoupledStep:
         self.rod_steps = [self._rod_step(group) for group in groups]
         self._states = [self.model.group_state(group) for group in groups]
         self._places = [Places(self.coupled, group) for group in groups]
+        if self.model.version:  # the groups are of the scene
+            for places in self._places:
+                places.take_parameters()
         self._kernels = [kernels.rod_kernels(group.kind, real) for group in groups]
         self._search = step.newton.contact.search
         self.runs = RodCulling(self._search) if len(self._search.lists) == 1 else None
