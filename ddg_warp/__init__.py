@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time see `_HOME`
     from ddg_warp.scene.descriptions import Dynamics, PathAnalysis, Statics
     from ddg_warp.scene.drag import Granular, Viscous
     from ddg_warp.scene.equilibrium_path import Displacement, StopCriterion
+    from ddg_warp.scene.field import Samples
     from ddg_warp.scene.grip import Grip
     from ddg_warp.scene.law import Law
     from ddg_warp.scene.material import Circle, Ellipse, Material, Rectangle, Ribbon, Stiffness
@@ -60,6 +61,7 @@ __all__ = [
     "Recorder",
     "Rectangle",
     "Ribbon",
+    "Samples",
     "Scene",
     "SceneError",
     "SceneWarning",
@@ -101,6 +103,7 @@ _HOME = {
     "Recorder": "run.recorder",
     "Rectangle": "scene.material",
     "Ribbon": "scene.material",
+    "Samples": "scene.field",
     "Scene": "scene.scene",
     "SceneError": "errors",
     "SceneWarning": "errors",

@@ -341,21 +341,36 @@ def amplitude(name: str, function) -> Callable[[float], float] | None:
     return function
 
 
-def value_at(name: str, function, t: float, columns: int = 0, error=SolverError) -> np.ndarray:
+def value_at(
+    name: str, function, t: float, columns: int | None = 0, error=SolverError, arguments: tuple = ()
+) -> np.ndarray:
     """Return the value at t of a user function: finite, () or, with `columns`, (columns,) or (n, columns).
+
+    Args:
+        columns: number of components of a vector, 0 for one number, None for any shape.
+        arguments: arguments of the function before the time.
 
     Raises:
         SolverError: the value is invalid, or the function failed; names the function, the source line and the time.
     """
-    shapes = f"({columns},) or (n, {columns})" if columns else "one number"
     try:
-        result = function(t)
+        result = function(*arguments, t)
     except Exception as reason:
         text = f"{_written(name, function)} fails at t = {t:g}: {type(reason).__name__}: {reason}"
         raise _refusal(error, f"{text}; make it defined from t = 0 on") from reason
+    if type(result) in (float, np.float64) and not columns and abs(result) <= MOST:  # fast paths, taken every step
+        return np.asarray(result)
+    if columns is None and type(result) is np.ndarray and result.dtype == float and result.size:
+        flat = result.reshape(-1)
+        if flat @ flat <= MOST**2:
+            return result
+    shapes = f"({columns},) or (n, {columns})" if columns else "one number" if columns == 0 else "an array of numbers"
     result = float(result) if isinstance(result, bool | np.bool_) else result  # such as `t < 1`
     value = floats(result, np.zeros((0, 0, 0)))
-    fits = value.ndim in (1, 2) and value.shape[-1] == columns if columns else value.ndim == 0
+    if columns is None:
+        fits = value.size > 0
+    else:
+        fits = value.ndim in (1, 2) and value.shape[-1] == columns if columns else value.ndim == 0
     if not fits:
         raise _refusal(error, f"{_written(name, function)} is {shown(result)} at t = {t:g}; it is {shapes}")
     if not (np.abs(value) <= MOST).all():

@@ -117,6 +117,7 @@ class Adjoint:
     def upload(self, start: float, dt: float) -> bool:
         """Upload prescribed data for a backward pass; return True if a captured graph is outdated."""
         s, changed = self.integrator._solved(dt), False
+        self.model.fields.to(self.integrator.evaluation_time(start, dt), self.integrator.given_fields)
         for adjoint, part in zip(self.parts, self.integrator._parts, strict=True):
             changed = adjoint.suit(part, s) or changed
             adjoint.upload(start, start + dt)
@@ -200,6 +201,7 @@ class EquilibriumAdjoint:
         check_state("vjp", self.model, state)
         check_state("vjp", self.model, cotangent)
         control_values, inputs = checked(controls, self.model, "pull"), []
+        self.model.fields.to(state.time, control_values.get("fields"))
         for adjoint in self.parts:
             adjoint.solve.tangent.give(control_values)
             gravity = np.broadcast_to(control_values.get("gravity", self.model.scene.gravity), (self.model.worlds, 3))

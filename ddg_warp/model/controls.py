@@ -1,6 +1,7 @@
 """Controls: loads, poses of grips, gravity and field of one time step or static solve, per world."""
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,12 @@ from ddg_warp.errors import SceneError
 class Controls:
     """Control inputs of one step, constant over it: `integrator.step(state, dt, controls)`.
 
-    Every field is one array for all worlds, or has an axis of worlds in front. Fields left out are as in the scene. Motions and loads
+    Every input is one array for all worlds, or has an axis of worlds in front. Inputs left out are as in the scene. Motions and loads
     that the scene gives as functions of time stay, the same in all worlds; control loads add to them. Controls belong to the step
-    alone: later queries of a state (reactions, spectra, energy of gravity) know only the loads of the scene.
+    alone: later queries of a state (reactions, spectra, energy of gravity) know only the loads and fields of the scene.
 
     `statics.solve(model, controls=...)` takes them, too. The load parameter then scales loads, gravity and the field like the loads
-    of the scene, and poses are reached at its end.
+    of the scene. Poses are reached at its end, and fields on a straight path from the fields of the scene at its start.
 
     Attributes:
         poses: pose of every `Grip` at the end of the step (grips, 6) or (worlds, grips, 6), in the order of `model.grips`: translation
@@ -29,6 +30,8 @@ class Controls:
         moments: about the tangents of edges (edges,) or (worlds, edges) [N m], in the order of `State.angles`.
         gravity: (3,) or (worlds, 3) [m/s^2], instead of the scene's.
         field: (3,) or (worlds, 3) [T], a uniform magnetic field on top of the scene's.
+        fields: values that replace the fields of the scene, by name; see `Scene.prescribe`. One number, one number an element, or both
+            with an axis of worlds in front; (worlds,) is one number a world.
     """
 
     poses: Any = None
@@ -36,23 +39,45 @@ class Controls:
     moments: Any = None
     gravity: Any = None
     field: Any = None
+    fields: Any = None
 
     def checked(self, model) -> dict[str, np.ndarray]:
-        """Return the given fields by name, each with an axis of worlds (1 or worlds, ...).
+        """Return the given inputs by name, each with an axis of worlds (1 or worlds, ...); "fields" is a dict.
 
         Raises:
             SceneError: a shape does not fit, a value is not finite, or the model has nothing that it could act on.
         """
-        expected = shapes(model)
-        inputs = {field.name: getattr(self, field.name) for field in fields(self)}
-        result = {
-            name: _numbers(name, values, expected[name], model.worlds)
-            for name, values in inputs.items()
-            if values is not None
-        }
-        _refuse_missing(model, result)
-        _refuse_out_of_plane(model, result)
+        inputs = {name: values for name, values in vars(self).items() if values is not None}
+        prescribed = inputs.pop("fields", None)
+        expected = shapes(model) if inputs else {}
+        result = {name: _numbers(name, values, expected[name], model.worlds) for name, values in inputs.items()}
+        if inputs:
+            _refuse_missing(model, result)
+            _refuse_out_of_plane(model, result)
+        if prescribed is not None:
+            result["fields"] = _checked_fields(model, prescribed)
         return result
+
+
+def _checked_fields(model, values) -> dict[str, np.ndarray]:
+    """Return values of fields by name, as of `FieldElements.given`."""
+    if not isinstance(values, Mapping):
+        raise SceneError(
+            f"Controls: fields are {argument_checks.shown(values)}; give values by name, as {{'muscle': ...}}"
+        )
+    return {name: named_field(model, name).given(each) for name, each in values.items()}
+
+
+def named_field(model, name: str):
+    """Return the field of a name, `FieldElements`.
+
+    Raises:
+        SceneError: the model has no such field.
+    """
+    if name not in model.fields.items:
+        listed = ", ".join(map(repr, model.fields.items)) or "none; add one by scene.prescribe(name, parameter)"
+        raise SceneError(f"Controls: fields: there is no field {name!r}; the model has {listed}")
+    return model.fields.items[name]
 
 
 def checked(controls: Controls | None, model, call: str = "step") -> dict[str, np.ndarray]:
@@ -62,7 +87,7 @@ def checked(controls: Controls | None, model, call: str = "step") -> dict[str, n
     if not isinstance(controls, Controls):
         raise SceneError(
             f"{call}: controls are {argument_checks.shown(controls)}; give "
-            "Controls(poses=..., forces=..., moments=..., gravity=..., field=...)"
+            "Controls(poses=..., forces=..., moments=..., gravity=..., field=..., fields=...)"
         )
     return controls.checked(model)
 

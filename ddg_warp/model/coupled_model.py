@@ -104,12 +104,25 @@ class ElementSetArrays:
             parameters: all parameters of the term by name, each one number or one an element.
         """
         count, changed = max(np.size(values) for values in parameters.values()), {}
-        for name in (parameter.name for parameter in self.term.parameters if parameter.rest):
+        for name in self._rest_names:
             current = self.parameters[name]
             full = np.repeat(current, self.elements // current.shape[1], axis=1)
             full[:, first : first + count] = parameters[name]
             changed[name] = full if len(full) > 1 else _short(full[0])[None]
         return self.parameters.set(**changed)
+
+    def write_rest(self, first: int, parameters: dict[str, np.ndarray]) -> None:
+        """Write rest-shape parameters as `set_rest` does, but to memory of one number per element and world that stays."""
+        count = max(np.size(values) for values in parameters.values())
+        indices = first + np.arange(count) + self.elements * np.arange(self.worlds)[:, None]
+        for name in self._rest_names:
+            if name not in self.parameters.prescribed:
+                self.parameters.prescribe(name, (self.worlds, self.elements))
+            self.parameters.write(name, [(indices, parameters[name])])
+
+    @property
+    def _rest_names(self) -> list[str]:
+        return [parameter.name for parameter in self.term.parameters if parameter.rest]
 
 
 class CoupledModel:

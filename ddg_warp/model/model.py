@@ -19,6 +19,7 @@ from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.rod_layout import rod_storage
 from ddg_warp.kernels.stepping import rod_step
 from ddg_warp.model import rod_shell_coupling
+from ddg_warp.model.fields import Fields
 from ddg_warp.model.parameters import valid_numbers
 from ddg_warp.model.rebuild import ModelBuilder
 from ddg_warp.model.rod_group import RodGroup
@@ -44,6 +45,7 @@ class Model:
         worlds: number of independent copies.
         allow_rounding: whether steps and solves run although float32 rounding exceeds its limit.
         order: points and edges in the user's order.
+        fields: rest strains of rods that the scene prescribes, see `Scene.prescribe`.
     """
 
     def __init__(
@@ -69,6 +71,7 @@ class Model:
         ]
         self.coupled = self._build_coupled() if needs_coupling(scene) else None
         self.order = UserNumbering(self)
+        self.fields = Fields(self)
 
     def _build_coupled(self):
         from ddg_warp.compile.coupled.builder import compile_coupled
@@ -215,10 +218,12 @@ class Model:
                 rod of a group, clamped ends included.
 
         Raises:
-            ValueError: nothing has the term, the term has no such parameter, or the shape or a value is wrong; nothing is changed.
+            ValueError: nothing has the term, the term has no such parameter, a field prescribes it, or the shape or a value is wrong;
+                nothing is changed.
         """
         parts = self.coupled.sets if self.coupled is not None else ()
         values, remade = self.valid_values(term, parameter, values), False
+        self.fields.refuse("set_parameter", f"{term}.{parameter}")
         if values.shape == (1,) and self.worlds == 1:
             values = values.reshape(())  # one a world, of one world, is one number
         name = f"{term}.{parameter}"
@@ -237,6 +242,7 @@ class Model:
         """
         self.version += 1
         self.layout += remade
+        self.fields.forget()
 
     def valid_values(self, term: str, parameter: str, values) -> np.ndarray:
         """Return values of a parameter as a checked array of numbers.

@@ -16,20 +16,23 @@ class ParameterTable:
         values: arrays of two dimensions by name, of size 1 along an axis on which they do not depend; `set` changes them.
         version: counter of changes.
         foreign: names of parameters whose device values, such as tensors, the host does not know.
+        prescribed: names of parameters that fields change from step to step, see `ddg_warp.model.fields`.
+        offsets: index of the first value of every parameter in the buffer, by name.
     """
 
     def __init__(self, values: dict[str, np.ndarray], along: int, real, device):
         """Upload values by name; `along` is the axis of elements, 0 or 1."""
         self.values, self._along, self._real, self._device = dict(values), along, real, device
-        self.version, self.foreign = 0, set()
+        self.version, self.foreign, self.prescribed = 0, set(), set()
+        self._target, self._staging = (None, None), {}  # buffer and its view; pinned arrays by name
         self.upload()
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self.values[name]
 
     def may_be_other_than_zero(self, name: str) -> bool:
-        """Return True if a parameter is nonzero anywhere, or unknown to the host."""
-        return name in self.foreign or bool(self.values[name].any())
+        """Return True if a parameter is nonzero anywhere, changes by a field, or is unknown to the host."""
+        return name in self.foreign or name in self.prescribed or bool(self.values[name].any())
 
     @property
     def arrays(self) -> tuple[wp.array, wp.array]:
@@ -49,17 +52,44 @@ class ParameterTable:
         if not fits:
             self.upload()
             return True
-        sizes = np.cumsum([0, *(current.size for current in self.values.values())]).tolist()
-        for offset, name in zip(sizes, self.values, strict=False):
-            if name in updates:
-                flat = wp.array(updates[name].ravel(), dtype=self._real, device="cpu")
-                wp.copy(self.buffer, flat, dest_offset=offset)
+        for name, new in updates.items():
+            flat = wp.array(new.ravel(), dtype=self._real, device="cpu")
+            wp.copy(self.buffer, flat, dest_offset=self.offsets[name])
         return False
+
+    def prescribe(self, name: str, shape: tuple) -> None:
+        """Expand a parameter to a shape for `write`, before kernels are captured."""
+        self.values[name] = np.array(np.broadcast_to(self.values[name], shape))
+        self.prescribed.add(name)
+        self.upload()
+
+    def write(self, name: str, entries: list) -> None:
+        """Overwrite entries of a prescribed parameter, on the host and in place on the device; version and memory stay.
+
+        Args:
+            entries: (flat indices, values) each.
+        """
+        values = self.values[name]
+        if not values.flags.writeable:
+            values = self.values[name] = values.copy()
+        values = values.reshape(-1)
+        for indices, entry in entries:
+            values[indices] = entry
+        offset = self.offsets[name]
+        if self.buffer.device.is_cuda:
+            if name not in self._staging:
+                self._staging[name] = _Staging(values.size, self._real, self.buffer.device)
+            self._staging[name].copy(values, self.buffer, offset)
+            return
+        if self._target[0] is not self.buffer:
+            self._target = self.buffer, self.buffer.numpy()
+        self._target[1][offset : offset + values.size] = values
 
     def upload(self) -> None:
         """Copy `values` to the device."""
-        offset, table = 0, []
-        for values in self.values.values():
+        offset, table, self.offsets = 0, [], {}
+        for name, values in self.values.items():
+            self.offsets[name] = offset
             first = values.shape[1] if values.shape[0] > 1 else 0
             strides = first, int(values.shape[1] > 1)
             table.append((offset, *(strides if self._along == 0 else strides[::-1])))
@@ -67,6 +97,27 @@ class ParameterTable:
         flat = np.concatenate([np.ravel(values) for values in self.values.values()])
         self.buffer = wp.array(flat, dtype=self._real, device=self._device)
         self.table = wp.array(np.array(table, np.int32), dtype=int, device=self._device)
+
+
+STAGES = 4  # pinned arrays of a parameter; the host runs ahead of copies by as many steps
+
+
+class _Staging:
+    """Pinned host arrays for copies to a device buffer that the host does not wait for."""
+
+    def __init__(self, size: int, real, device):
+        self._arrays = [wp.zeros(size, dtype=real, device="cpu", pinned=True) for _ in range(STAGES)]
+        self._views = [array.numpy() for array in self._arrays]
+        self._copied, self._next, self._device = [None] * STAGES, 0, device
+
+    def copy(self, values: np.ndarray, buffer: wp.array, offset: int) -> None:
+        """Copy values (size,) to a buffer from an offset on."""
+        stage, self._next = self._next, (self._next + 1) % STAGES
+        if self._copied[stage] is not None:
+            wp.synchronize_event(self._copied[stage])
+        self._views[stage][:] = values
+        wp.copy(buffer, self._arrays[stage], dest_offset=offset)
+        self._copied[stage] = wp.get_stream(self._device).record_event(self._copied[stage])
 
 
 def _spread(new: np.ndarray, shape: tuple) -> np.ndarray:

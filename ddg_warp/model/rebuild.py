@@ -21,6 +21,7 @@ class ModelBuilder:
             "allow_rounding": model.allow_rounding,
         }
         self.version = model.version
+        model.fields.to(0.0)  # without controls, which may differ between worlds
         self.parameters = [
             {name: _in_worlds(name, values, axis, model.worlds, worlds) for name, values in table.values.items()}
             for table, axis in _tables(model)

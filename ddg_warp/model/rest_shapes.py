@@ -98,8 +98,15 @@ def bilayer_curvature(mismatch: float, h1: float, h2: float, young1: float = 1.0
     return 6.0 * mismatch * (1.0 + m) ** 2 / (h * (3.0 * (1.0 + m) ** 2 + (1.0 + m * n) * (m**2 + 1.0 / (m * n))))
 
 
-def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, angle=None, plate=None) -> None:
-    """Set the rest shape of a shell; see `Model.set_rest`. `plate`: stored values of its `Plate` by name."""
+def set_rest(
+    model, shell: int, *, points=None, metric=None, curvature=None, angle=None, plate=None, prescribed: bool = False
+) -> None:
+    """Set the rest shape of a shell; see `Model.set_rest`.
+
+    Args:
+        plate: stored values of its `Plate` by name.
+        prescribed: True to write to existing memory without a new version of the model, for fields.
+    """
     check_model("set_rest", model)
     if model.coupled is None or not 0 <= argument_checks.index("set_rest: shell", shell) < len(
         model.coupled.host.shells
@@ -137,6 +144,10 @@ def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, ang
     elements_of = shells.shell_elements(surface, plate, coupled_shell.kinds, bending, membrane)
     places = [(sets[e.term.law], coupled_shell.first[e.term.name], e.parameters) for e in elements_of if len(e)]
     coupled_shell.plate = plate  # nothing can fail after this
+    if prescribed:
+        for part, first, parameters in places:
+            part.write_rest(first, parameters)
+        return
     model.note_change(any([part.set_rest(first, parameters) for part, first, parameters in places]))
 
 
@@ -170,6 +181,7 @@ def set_rest_strains(model, strains: dict) -> None:
             raise ValueError(
                 f"set_rest_strains: {name!r} is no rest strain of a model whose rods are all uncoupled; {why}"
             )
+        model.fields.refuse("set_rest_strains", name)
         count, groups = model.order.elements(name)
         values = model.valid_values(*name.rsplit(".", 1), values)
         if values.shape not in ((count,), (model.worlds, count)):

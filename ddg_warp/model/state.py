@@ -267,3 +267,9 @@ def check_state(call: str, model, state) -> None:
         )
     if state.model is not model:
         raise SceneError(f"{call}: the state is of another model; give one that this model made, such as model.state()")
+
+
+def query(call: str, model, state) -> None:
+    """Refuse an argument that is no state of the model, and set the fields of the model to the time of the state."""
+    check_state(call, model, state)
+    model.fields.to(state.time)

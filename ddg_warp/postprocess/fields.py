@@ -9,7 +9,7 @@ import numpy as np
 from ddg_warp import argument_checks
 from ddg_warp.capture_lock import launches
 from ddg_warp.model.model import check_model
-from ddg_warp.model.state import check_state
+from ddg_warp.model.state import query
 
 POINT_FIELDS = {
     "axial_force": "axial force of rods, positive in tension [N]",
@@ -90,7 +90,7 @@ def cell_fields(model, state, names: Sequence[str]) -> dict[str, np.ndarray]:
 def _check(call: str, model, state, names, allowed) -> None:
     """Refuse arguments that are no model, no state of the model, or no field name."""
     check_model(call, model)
-    check_state(call, model, state)
+    query(call, model, state)
     for name in check_fields(names):
         argument_checks.choice(call, name, allowed)
 

@@ -10,7 +10,7 @@ from ddg_warp.capture_lock import launches
 from ddg_warp.compile.dof_map import gathered
 from ddg_warp.kernels.terms import AXISYMMETRIC, MAGNETS, SHELLS
 from ddg_warp.model.model import check_model
-from ddg_warp.model.state import check_state
+from ddg_warp.model.state import query
 from ddg_warp.postprocess import end_moments
 from ddg_warp.solve.equilibrium.tangent import Tangent
 from ddg_warp.solve.forces.drag import CoupledDrag, RodGroupDrag
@@ -151,7 +151,7 @@ def drag(model, state) -> Drag:
 def _check(call: str, model, state) -> None:
     """Refuse arguments that are no model, or no state of the model."""
     check_model(call, model)
-    check_state(call, model, state)
+    query(call, model, state)
 
 
 def _each_world(values: np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ from ddg_warp.capture_lock import launches
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.densities.quadratic import quadratic
 from ddg_warp.model.model import check_model
-from ddg_warp.model.state import check_state
+from ddg_warp.model.state import query
 from ddg_warp.postprocess.quantities import group_strains
 from ddg_warp.solve.equilibrium.rigid_modes import rigid_modes
 from ddg_warp.solve.equilibrium.stability import lowest_factors
@@ -56,7 +56,7 @@ def rest_strains(model, state=None, load: float = 1.0) -> dict[str, np.ndarray]:
     """
     check_model("rest_strains", model)
     if state is not None:
-        check_state("rest_strains", model, state)
+        query("rest_strains", model, state)
     state, load = state or model.state(), argument_checks.number("rest_strains: load", load)
     _refuse("rest_strains", model)
     tangent, result = Tangent(model), {}
@@ -90,7 +90,7 @@ def least_stiffness(model, state) -> np.ndarray:
     from scipy import sparse
 
     check_model("least_stiffness", model)
-    check_state("least_stiffness", model, state)
+    query("least_stiffness", model, state)
     _refuse("least_stiffness", model)
     tangent, result = Tangent(model), np.zeros((model.worlds, model.scene.rod_count))
     forces = [_Elements.of(part, state).forces for part in tangent.parts]

@@ -12,6 +12,7 @@ from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.scene import drag, validate
 from ddg_warp.scene.descriptions import Dynamics, Load, PathAnalysis, RodBatch, Statics, Support
+from ddg_warp.scene.field import Fields
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.law import Law, laws_of
 from ddg_warp.scene.material import Material, Stiffness, stiffness_of
@@ -21,7 +22,7 @@ from ddg_warp.scene.shells_and_joints import Structures
 
 @argument_checks.called
 @dataclass(kw_only=True, repr=False, eq=False)
-class Scene(Structures):
+class Scene(Structures, Fields):
     """Description of rods and shells with supports and loads, from which `build` compiles a model.
 
     A model is independent of later changes of the scene.

@@ -316,6 +316,26 @@ POSE = ddg.Controls(poses=[[0.1, 0.0, 0.0, 0.0, 0.1, 0.0]])
 CALLS["Grip"] = Call(ddg.Grip, lambda **named: observe_motion(ddg.Grip(**named), POSE), {}, {"pivot": (0, 0, 1)})
 
 
+# --- fields ---
+CURL = {"name": "curl", "parameter": "rod_bend_twist.rest_1", "values": 1.0}
+scene_call("prescribe", CURL, {
+    "name": Change("", refused=True), "parameter": "rod_bend_twist.rest_2", "values": 2.0, "rods": [1],
+    "over": Change("arc_length", {"values": lambda *where: np.size(where[0])})}, two_rods)  # fmt: skip
+
+
+def observe_samples(**named) -> list:
+    """Observe rods with a natural curvature of samples."""
+    scene = ddg.Scene()
+    two_rods(scene)
+    scene.prescribe("curl", "rod_bend_twist.rest_1", ddg.Samples(**named), over="arc_length")
+    return observe_steps(scene)
+
+
+CALLS["Samples"] = Call(ddg.Samples, observe_samples, {"values": [0.0, 1.0], "arc_lengths": [0.0, 0.5]}, {
+    "values": [0.0, 2.0], "arc_lengths": [0.1, 0.5],
+    "times": Change([0.0, 1.0], {"values": [[0.0, 1.0], [1.0, 2.0]]}, before=[0.5, 1.0])})  # fmt: skip
+
+
 # --- shells ---
 SHEET = dict(zip(("points", "triangles"), meshes.rectangle(2, 2), strict=True))
 DOME = np.column_stack([np.sin(np.linspace(0.0, 1.0, 5)), np.cos(np.linspace(0.0, 1.0, 5))])

@@ -40,6 +40,7 @@ def model(kind: str = "arc", worlds: int = 1):
         scene.clamp(0, motion=ddg.Grip())
         scene.magnetize(0, 1e5)
         scene.magnetic_field((0.0, 0.0, 0.0))
+        scene.prescribe("curl", "rod_bend_twist.rest_1")
     elif kind == "touching":
         scene.add_rod(line(), section=ddg.Circle(0.01), material=RUBBER, name="low")
         scene.add_rod(line(6, 0.021), section=ddg.Circle(0.01), material=RUBBER, name="high")
@@ -101,7 +102,7 @@ def observe_controls(**named) -> list:
 
 CALLS["Controls"] = Call(ddg.Controls, observe_controls, {}, {
     "poses": [[0.1, 0, 0, 0, 0.1, 0]], "forces": np.full((6, 3), 0.1), "moments": np.full(5, 0.1), "gravity": (1, 0, 0),
-    "field": (0, 0.1, 0)})  # fmt: skip
+    "field": (0, 0.1, 0), "fields": {"curl": 1.0}})  # fmt: skip
 
 
 def observe_adaptive_steps(**named) -> list:

@@ -85,6 +85,11 @@ class Corrector:
         check_model("continuation", model)
         if model.worlds != 1:
             raise SceneError(f"a path is followed in one world; the model has {model.worlds}")
+        if not model.fields.constant:
+            raise SceneError(
+                "continuation: fields that change with the load parameter are no loads along an arc; take statics.solve with "
+                "load_steps, or constant fields"
+            )
         self.options = options
         criterion = StaticsOptions(rtol=self.options.rtol, floor_factor=self.options.floor_factor, mode="follow")
         self.equilibrium = Equilibrium(model, criterion)

@@ -13,7 +13,7 @@ from ddg_warp import argument_checks
 from ddg_warp.compile.precision import lost_in_rounding
 from ddg_warp.errors import SceneError
 from ddg_warp.model.model import check_model
-from ddg_warp.model.state import check_state
+from ddg_warp.model.state import query
 from ddg_warp.solve.equilibrium.rigid_modes import rigid_modes
 from ddg_warp.solve.equilibrium.tangent import Tangent
 from ddg_warp.solve.linear.eigensolver import LowestFactors, ShiftInvertLanczos, dense
@@ -80,7 +80,7 @@ def spectrum(
         SolverError: float32 would lose the softest modes in rounding.
     """
     check_model("spectrum", model)
-    check_state("spectrum", model, state)
+    query("spectrum", model, state)
     argument_checks.count("spectrum: count", count)
     argument_checks.choice("spectrum: metric", metric, ("mass", "unit"))
     if tangent is not None and not isinstance(tangent, Tangent):
@@ -331,12 +331,13 @@ def buckling(model, free, loaded, count: int = 1) -> np.ndarray:
         ValueError: the first equilibrium is unstable, follower loads are not conservative, or no positive factor exists.
     """
     check_model("buckling", model)
-    for state in (free, loaded):
-        check_state("buckling", model, state)
+    for state in (loaded, free):
+        query("buckling", model, state)
     argument_checks.count("buckling: count", count)
     tangent = Tangent(model)
     dofs = np.flatnonzero(tangent.free)
     whole = tangent.stiffness(free)
+    query("buckling", model, loaded)
     start, end = (sparse.csc_matrix(matrix[dofs][:, dofs]) for matrix in (whole, tangent.stiffness(loaded)))
     if not (is_symmetric(start) and is_symmetric(end)):
         raise ValueError("loads that follow are not conservative here, the tangent is unsymmetric: take `critical`")

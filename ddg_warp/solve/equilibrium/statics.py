@@ -14,7 +14,7 @@ Every equilibrium has its outcome (`State.outcome`), the fraction of the loads n
 (`State.unbalanced`), and its stability (`State.stable`).
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -103,7 +103,8 @@ def solve(
         model: model to equilibrate.
         state: start of the search; the rest state by default. It stays unchanged. Grips keep their poses without `poses`.
         controls: control loads, gravity and magnetic field per world, scaled by the load parameter like the loads of the scene. Poses
-            of grips hold at `end`, reached on a straight path from the poses of the state.
+            of grips hold at `end`, reached on a straight path from the poses of the state. Fields do so from the fields of the scene
+            at `start`.
         load_steps: number of increments; a failed one is halved. In contact supports and obstacles stop before an object and continue
             once it has yielded; in mode "follow" the increment is halved instead. Large rotations of supports and obstacles get enough
             increments to resolve their arcs.
@@ -169,6 +170,7 @@ class Equilibrium:
         self.descent = DirectNewton(self)
         self.iterations = 0
         self.outcome, self.stiffness = "", None
+        self._fields = _fields_between(model, {}, 0.0, 1.0)
 
     @property
     def pcg_iterations(self) -> int:
@@ -233,6 +235,7 @@ class Equilibrium:
         self.tangent.poses = poses_between(state, inputs["poses"], start, end) if "poses" in inputs else None
         state = state.copy()
         state.stop()
+        self._fields = _fields_between(self.model, inputs.get("fields", {}), start, end)
         shapes = RestPath(self.model, rest if rest is not None else {})
         if self.coupled and self.coupled.arcs:
             load_steps = self.coupled.arcs.increments(state, inputs.get("poses"), start, end, load_steps)
@@ -251,6 +254,7 @@ class Equilibrium:
         current, whole, cuts = start, (end - start) / load_steps, 0
         if self._has_friction:
             self.coupled.wary = True
+        self.model.fields.to(start, self._fields(start))
         balanced = self._has_friction or self._balanced(state, start)
         while current != end:
             increment = whole * 0.5**cuts
@@ -337,6 +341,7 @@ class Equilibrium:
         Conjugate gradients detect only negative curvature they meet, and leave no saddles.
         """
         tangent, self.stiffness = self.tangent, None
+        self.model.fields.to(load_factor, self._fields(load_factor))
         if not tangent.free.any():
             begun, state = state, state.copy()
             tangent.move_supports(state, before, load_factor)
@@ -495,3 +500,14 @@ class Equilibrium:
         overturned = tangent.turned_over(q, tangent.dofs(alone))
         better = overturned or not potential(alone) <= potential(follow)
         return follow if better and np.isfinite(potential(follow)) else alone
+
+
+def _fields_between(model, ends: Mapping, start: float, end: float) -> Callable[[float], dict]:
+    """Return the function from load parameter to values of fields on the straight path from the scene's at `start` to `ends`."""
+    begins = {name: model.fields.items[name].at(start) for name in ends}
+
+    def at(load_factor: float) -> dict[str, np.ndarray]:
+        fraction = (load_factor - start) / (end - start) if end != start else 1.0
+        return {name: begins[name] + fraction * (ends[name] - begins[name]) for name in ends}
+
+    return at

@@ -172,7 +172,8 @@ class CoupledNewton:
         if self.coupled.host.contact_parameters:
             return "progressive"
         bending = [part for part in self.coupled.sets if part.term.measure.packed and not self.frozen]
-        if any(part.parameters.foreign.intersection(part.term.rest) for part in bending):
+        changing = [part.parameters.foreign | part.parameters.prescribed for part in bending]
+        if any(names.intersection(part.term.rest) for names, part in zip(changing, bending, strict=True)):
             return "progressive"
         edge_rotations = (
             part.parameters[name] * part.parameters["measure"] for part in bending for name in part.term.rest

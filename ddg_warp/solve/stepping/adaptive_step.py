@@ -99,10 +99,14 @@ class AdaptiveStepper:
         end, begin = (checked(values, model, "AdaptiveStepper.advance") for values in (controls, start))
         if "poses" in begin:
             raise SceneError("AdaptiveStepper.advance: poses begin where the state has them; leave them out of start")
+        if "fields" in begin:
+            raise SceneError(
+                "AdaptiveStepper.advance: fields of controls are constant over the advance; leave them out of start"
+            )
         usual = {"gravity": np.array(model.scene.gravity, float)[None]}
         ramps = {
             name: [inputs.get(name, usual.get(name, 0.0)) for inputs in (begin, end)]
-            for name in ((begin | end).keys() - {"poses"} if begin else ())
+            for name in ((begin | end).keys() - {"poses", "fields"} if begin else ())
         }
         poses = poses_between(state, end["poses"], 0.0, 1.0) if "poses" in end else None
 

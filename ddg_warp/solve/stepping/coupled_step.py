@@ -179,8 +179,8 @@ class CoupledStep(StepDriver):
     def prescribe(self, t0: float, t1: float) -> None:
         """Upload supports, loads, magnetic field and flow between t0 and t1."""
         super().prescribe(t0, t1)
-        for rod_step in self._rods:
-            rod_step.prescribe(t0, t1)
+        if self.decoupled:
+            self.decoupled.prescribe(t0, t1)
         if self.arcs:
             self._cut(self.arcs.levels(t0, t1), t0, t1)
 

@@ -36,6 +36,7 @@ class DecoupledStep:
     def __init__(self, step, groups: list[RodGroup]):
         self.step_of, self.model, self.coupled = step, step.model, step.coupled
         real, device, worlds = self.model.types.real, self.model.wp_device, self.coupled.worlds
+        self._fields, self._written = self.model.fields.bind(groups), 0  # before kernels read the memory of parameters
         self.rod_steps = [self._rod_step(group) for group in groups]
         self._states = [self.model.group_state(group) for group in groups]
         self._places = [Places(self.coupled, group) for group in groups]
@@ -85,6 +86,15 @@ class DecoupledStep:
             ):
                 self.rod_steps[i], changed = self._rod_step(rod_step.group, means=means, counts_of=rod_step), True
         return changed
+
+    def prescribe(self, t0: float, t1: float) -> None:
+        """Upload prescribed data of the rod groups between t0 and t1, fields of the model included."""
+        fields = self.model.fields
+        if fields and self._written != fields.count:
+            fields.write(self._fields)
+            self._written = fields.count
+        for rod_step in self.rod_steps:
+            rod_step.prescribe(t0, t1)
 
     def renew(self) -> None:
         """Rebuild the BVH of runs, on devices where tests only refit."""

@@ -134,6 +134,7 @@ class Integrator:
             self._worlds, self._first = WorldReset(model), (None, None)
             self._buffers = [StateBuffer(model), StateBuffer(model)]
         self._graphs = Graphs(model, self._load_modules)
+        self.given_fields: dict[str, np.ndarray] = {}  # values of fields in the controls of a step
         self._steps_since_check = 0
         self._dt = wp.zeros(model.worlds, dtype=model.types.real, device=model.wp_device)
         self._dt_host = None
@@ -149,7 +150,7 @@ class Integrator:
 
         Args:
             state: start of the step; dt: step length [s].
-            controls: poses of grips, control loads, gravity and magnetic field of this step, per world; see `Controls`.
+            controls: poses of grips, control loads, gravity, magnetic field and fields of this step, per world; see `Controls`.
 
         Raises:
             SolverError: a rod failed within the retries, or float32 would lose the motion in rounding; the message names rod and
@@ -218,6 +219,7 @@ class Integrator:
     @timers.root("step")
     def advance(self, source: int, start: float, dt: float, anew: bool = False) -> None:
         """Step from one buffer at the time `start` to the other; `anew` for an outside state: see `forget`."""
+        self.model.fields.to(self.evaluation_time(start, dt), self.given_fields)
         for part in self._parts:
             part.prescribe(start, start + dt)
 
@@ -345,6 +347,7 @@ class Integrator:
     @timer("controls")
     def _control(self, inputs: dict[str, np.ndarray], source: int) -> None:
         """Upload the controls of a step from a buffer; rebuild the steppers with the first control load."""
+        self.given_fields = inputs.get("fields", {})
         if self.given is None and any(name in inputs for name in LOADS):
             self.given = Given(self.model)
             self._remake()
@@ -377,6 +380,10 @@ class Integrator:
     def _parts(self) -> list:
         """Steppers of the rod groups and of the coupled system."""
         return self._rod_steps if self._coupled is None else [*self._rod_steps, self._coupled]
+
+    def evaluation_time(self, start: float, dt: float) -> float:
+        """Return the evaluation time of a step of dt [s]: the end, or the middle with the midpoint rule."""
+        return start + self._solved(dt)
 
     def _solved(self, dt: float) -> float:
         """Return the length [s] of the implicit Euler step solved in a step of dt; see `kernels.stepping.time_step`."""
