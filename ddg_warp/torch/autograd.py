@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from ddg_warp.errors import SceneError
+from ddg_warp.torch.controls import FIELD
 from ddg_warp.torch.grip_poses import by_last_poses
 
 
@@ -148,16 +149,17 @@ class Balance(torch.autograd.Function):
         with engine.turn():
             engine.tables.write(call.parameters, parameters)
             for factor, state, *load_step in reversed(engine.way(end, output)):
-                inputs = engine.balance_backward(factor, state, controls, cotangent, *load_step)
+                fraction = (factor - begin) / (end - begin) if end != begin else 1.0
+                on_path = engine.controls.on_path(controls, begin, fraction)
+                inputs = engine.balance_backward(factor, state, on_path, cotangent, *load_step)
                 by_input = engine.tables.vjp(call.parameters, inputs, flags)
                 for name, value in controls.items():
                     by_load = engine.controls.vjp(name, value, inputs, flags)
                     scaled = name in ("forces", "moments", "field")  # by the load parameter; gravity has been already
                     if name == "poses" and factor != end:
-                        by_load = by_last_poses(
-                            engine.poses_of(first), value, (factor - begin) / (end - begin), by_load
-                        )
-                    by_input.append(factor * by_load if scaled else by_load)
+                        by_load = by_last_poses(engine.poses_of(first), value, fraction, by_load)
+                    weight = factor if scaled else fraction if name.startswith(FIELD) else 1.0
+                    by_input.append(weight * by_load)
                 gradients = [a + b for a, b in zip(gradients, by_input, strict=True)] if gradients else by_input
                 cotangent = engine.by_equilibrium
         return None, None, *([None] * count), *gradients

@@ -8,6 +8,8 @@ from ddg_warp.solve.forces.control_loads import LOADS
 from ddg_warp.solve.forces.prescribed_motion import counts_revolutions, rotations_between
 from ddg_warp.torch.state_layout import view
 
+FIELD = "fields/"  # keys of fields among controls: this and the name
+
 
 class StepControls:
     """Controls of the steps of an engine."""
@@ -17,6 +19,7 @@ class StepControls:
         real = wp.dtype_to_torch(self.model.types.real)
         self._usual = torch.tensor(np.array(self.model.scene.gravity, float), dtype=real, device=engine.device)
         self._pulled_by = False  # True if the last backward pass had gravity as a control
+        self._fields, self._has_tensors = {}, False  # storage of fields by name; True if memory has tensors of a step
 
     def give(self, controls: dict) -> None:
         """Write loads and poses to the integrator; masses given as parameters count as loads, since residuals are scaled by loads."""
@@ -68,6 +71,53 @@ class StepControls:
         else:
             target.zero_()
 
+    def give_fields(self, t: float, controls: dict) -> None:
+        """Write the fields at a time to parameter memory: of the scene, then tensors."""
+        fields = self.model.fields
+        if self._has_tensors:
+            fields.forget()
+        fields.to(t)
+        self._has_tensors = False
+        for name, value in controls.items():
+            if name.startswith(FIELD):
+                self._has_tensors = True
+                for part, row, size, indices, elements in self._storage(name):
+                    table = part.parameters
+                    memory = view(table.buffer).narrow(0, table.offsets[row], size)
+                    memory[indices] = value[:, elements]
+
+    def on_path(self, controls: dict, begin: float, fraction: float) -> dict:
+        """Return controls with fields at a fraction of the straight path from the fields of the scene at `begin`."""
+        items = self.model.fields.items
+        starts = {name: items[name.removeprefix(FIELD)].at(begin) for name in controls if name.startswith(FIELD)}
+        return controls | {
+            name: start + fraction * (controls[name] - start)
+            for name, start in ((name, torch.as_tensor(start).to(controls[name])) for name, start in starts.items())
+        }
+
+    def _storage(self, name: str) -> list[tuple]:
+        """Return rod groups and element sets of a field, each with its row, size, indices and elements of the field as tensors."""
+        if name not in self._fields:
+            item = self.model.fields.items[name.removeprefix(FIELD)]
+            self._fields[name] = [
+                (part, row, int(np.prod(shape)), *(torch.as_tensor(i, device=self.engine.device) for i in indices))
+                for part, row, shape, *indices in item.indices(self.model.groups, self.model.coupled)
+            ]
+        return self._fields[name]
+
+    def _by_field(self, name: str, result: torch.Tensor, inputs: list, flags) -> torch.Tensor:
+        """Return the gradient with respect to the values of a field (worlds, size)."""
+        for part, row, _, indices, elements in self._storage(name):
+            index = list(part.parameters.values).index(row)
+            if part in self.model.groups:
+                group = self.model.groups.index(part)
+                gradient = view(inputs[group].parameters)[index] * flags[group]
+            else:
+                place = self.model.coupled.sets.index(part)
+                gradient = view(inputs[-1].parameters[place])[index].reshape(self.model.worlds, -1) * flags[-1][:, None]
+            result[:, elements] = gradient.reshape(-1)[indices]
+        return result
+
     def give_gravity(self, controls: dict, adjoint) -> None:
         """Write the gravity of a step to the adjoint, which starts with that of the scene."""
         is_control = "gravity" in controls
@@ -87,6 +137,8 @@ class StepControls:
             return self.engine.by_poses * self.layout.by_world(flags)[:, None, None]
         result = torch.zeros_like(value)
         model, worlds = self.model, self.model.worlds
+        if name.startswith(FIELD):
+            return self._by_field(name, result, inputs, flags)
         if name == "field":
             for part, data in zip(model.coupled.sets, inputs[-1].data, strict=True):
                 measure = part.term.measure

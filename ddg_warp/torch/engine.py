@@ -24,7 +24,7 @@ from ddg_warp.solve.equilibrium import statics
 from ddg_warp.solve.stepping.graph_cache import Graphs
 from ddg_warp.solve.stepping.integrator import Integrator
 from ddg_warp.solve.stepping.world_reset import cubed
-from ddg_warp.torch.controls import StepControls
+from ddg_warp.torch.controls import FIELD, StepControls
 from ddg_warp.torch.grip_poses import Poses
 from ddg_warp.torch.notice import Notice
 from ddg_warp.torch.parameter_tensors import ParameterTensors
@@ -107,6 +107,7 @@ class Engine:
         self._renumber(integrator._coupled)
         integrator._prepare(dt, self.before)
         self.controls.give(controls)
+        self.controls.give_fields(integrator.evaluation_time(start, dt), controls)
         integrator.advance(0, start, dt, anew=True)
         s = integrator._solved(dt)
         wp.copy(self._codes, self._outcome_codes)
@@ -202,6 +203,7 @@ class Engine:
         adjoint = self._adjoint()
         self.controls.give_field(controls)
         self.controls.give_gravity(controls, adjoint)
+        self.controls.give_fields(self.integrator.evaluation_time(start, dt), controls)
         self._fill_all((before, after, cotangent), other_results)
         if adjoint.upload(start, dt):
             self._graphs.clear()
@@ -401,6 +403,7 @@ class Engine:
         load = {name: options[name] for name in LOAD if name in options}
         solver = self._static({name: value for name, value in options.items() if name not in LOAD})
         self._renumber(solver.coupled)
+        self.controls.give_fields(load.get("start", 0.0), {})
         last = solver.load(start, controls=_on_host(controls), way=path, **load)
         result = copies(tensors(last, self.fields)) + self.smooth_flags()
         if graded and last.sliding is not None:
@@ -451,6 +454,7 @@ class Engine:
         if velocity is not None:
             equilibrium.sliding = Sliding(wp.empty_like(equilibrium.coupled.v), increment)
             view(equilibrium.sliding.velocity).copy_(velocity)
+        self.controls.give_fields(end, {})
         inputs = adjoint.vjp(equilibrium, by_state, _on_host(controls))
         self.by_equilibrium = tensors(adjoint.by_before, self.fields) if adjoint.has_friction else None
         if posed:
@@ -500,4 +504,6 @@ def _cubes(part, islands: int) -> list[wp.array]:
 
 def _on_host(controls: dict) -> Controls:
     """Convert controls from tensors to host arrays for static solvers."""
-    return Controls(**{name: value.detach().cpu().numpy() for name, value in controls.items()})
+    values = {name: value.detach().cpu().numpy() for name, value in controls.items()}
+    fields = {name.removeprefix(FIELD): values.pop(name) for name in controls if name.startswith(FIELD)}
+    return Controls(**values, fields=fields or None)

@@ -12,13 +12,14 @@ from ddg_warp import argument_checks
 from ddg_warp.adjoint.implicit import refuse_gyroscopic
 from ddg_warp.capture_lock import alone
 from ddg_warp.errors import GradientWarning, SceneError
-from ddg_warp.model.controls import Controls, require_acting, shapes
+from ddg_warp.model.controls import Controls, named_field, require_acting, shapes
 from ddg_warp.model.model import check_model
 from ddg_warp.model.state import check_state
 from ddg_warp.solve.equilibrium import statics
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
 from ddg_warp.solve.stepping.integrator import SCHEMES, Integrator
 from ddg_warp.torch.autograd import Balance, Call, Step
+from ddg_warp.torch.controls import FIELD
 from ddg_warp.torch.engine import LOAD, Engine
 from ddg_warp.torch.rollout import Plan, bytes_of, plan, roll
 from ddg_warp.torch.state_layout import copies, tensors
@@ -50,7 +51,8 @@ class Simulator(torch.nn.Module):
 
     Parameters are tensors (), (B, 1), (1, E) or (B, E) by name, E the number of elements with the parameter. Names are
     "term.parameter" (see `Model.set_parameter`), or listed in `ddg_warp.torch.named_parameters`. Controls are dictionaries of "forces"
-    (B, P, 3) or (P, 3), "moments" (B, edges), "gravity" and "field" (B, 3) or (3,), and "poses" (B, grips, 6), see `Controls`. A world
+    (B, P, 3) or (P, 3), "moments" (B, edges), "gravity" and "field" (B, 3) or (3,), "poses" (B, grips, 6), and "fields", a
+    dictionary of tensors by name, see `Controls`. A world
     with a value that `set_parameter` would refuse, or with a control that is not finite, is not stepped. The outcome is then
     "invalid_input".
 
@@ -352,10 +354,10 @@ class Simulator(torch.nn.Module):
         model, worlds = engine.model, engine.model.worlds
         controls = _named("controls", "forces", controls)
         real = wp.dtype_to_torch(model.types.real)
-        result, shape_of = {}, shapes(model)
+        result, shape_of = self._fields(engine, controls.pop("fields", None)), shapes(model)
         for name, values in controls.items():
             if name not in shape_of:
-                raise SceneError(f"controls: there is no {name!r}; there are {', '.join(shape_of)}")
+                raise SceneError(f"controls: there is no {name!r}; there are {', '.join(shape_of)} and fields")
             tensor, shape = self._tensor(f"controls: {name}", values), shape_of[name]
             if tuple(tensor.shape) not in (shape, (worlds, *shape)):
                 raise SceneError(
@@ -365,6 +367,19 @@ class Simulator(torch.nn.Module):
             if not isinstance(values, torch.Tensor):  # check that values are finite and act on existing dofs
                 Controls(**{name: tensor.cpu().numpy()}).checked(model)
             result[name] = tensor.to(device=str(wp.device_to_torch(model.wp_device)), dtype=real).expand(worlds, *shape)
+        return result
+
+    def _fields(self, engine: Engine, values) -> dict:
+        """Return tensors (worlds, elements) of fields, with keys as of `ddg_warp.torch.controls.FIELD`."""
+        model, result = engine.model, {}
+        for name, each in _named("controls: fields", "muscle", values).items():
+            item, label = named_field(model, name), f"controls: fields: '{name}'"
+            if not isinstance(each, torch.Tensor):
+                item.given(each)  # check that values are finite
+            tensor = self._tensor(label, each)
+            tensor = tensor.reshape(item.flat(label, tensor.shape))
+            real = wp.dtype_to_torch(model.types.real)
+            result[FIELD + name] = tensor.to(device=engine.device, dtype=real).expand(engine.model.worlds, item.size)
         return result
 
     def _step(self, state: WorldState, full: list, controls: dict, version: int | None = None) -> WorldState:
