@@ -6,6 +6,8 @@ While it slides axially through the fingers, friction is mu times the total norm
 pull narrows the helices, so that they press harder. The fingers are rotated copies, 72 degrees apart.
 """
 
+from functools import partial
+
 import numpy as np
 
 import ddg_warp as ddg
@@ -41,7 +43,6 @@ def build(n: int = 60, friction: float = 0.3, dt: float = 0.01, damping: float =
         analysis=ddg.Dynamics(dt=dt, duration=END),
         mass_damping=damping,
         initial=lambda model: standing(model, seed),
-        callbacks=[lambda state: actuate(state.model, state.time)],
     )
     angle = 2.0 * np.pi * np.arange(FINGERS) / FINGERS
     out = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
@@ -53,6 +54,9 @@ def build(n: int = 60, friction: float = 0.3, dt: float = 0.01, damping: float =
         points, section=ddg.Circle(RADIUS), material=RUBBER, natural="straight", director=-out, name="fingers"
     )
     scene.clamp_end(fingers)
+    radius = TIGHT * (POST + RADIUS)
+    for name, strain, whole in (("curl", "rest_1", radius), ("twist", "rest_3", -RISE)):
+        scene.prescribe(name, f"rod_bend_twist.{strain}", partial(activated, whole / (radius**2 + RISE**2)))
     pulled = ddg.Motion(translation=lambda t: (0.0, 0.0, -SPEED * max(0.0, t - PULLS)))
     scene.add_obstacle(
         ddg.Capsule((0.0, 0.0, -1.5 * LENGTH), (0.0, 0.0, 0.5 * LENGTH), POST), motion=pulled, name="post"
@@ -63,7 +67,6 @@ def build(n: int = 60, friction: float = 0.3, dt: float = 0.01, damping: float =
 
 def standing(model, seed: int):
     """Return the initial state with jitter of the free nodes."""
-    actuate(model, 0.0)
     points = model.state().points()
     free = np.arange(model.scene.batches[0].nodes) > 1
     return model.state(
@@ -71,14 +74,9 @@ def standing(model, seed: int):
     )
 
 
-def actuate(model, t: float) -> None:
-    """Set the natural curvature and twist of fingers at a time [s]."""
-    activation = np.sin(0.5 * np.pi * min(1.0, t / WINDS)) ** 2
-    radius = TIGHT * (POST + RADIUS)
-    for name, whole in (("rest_1", radius), ("rest_3", -RISE)):
-        value = activation * whole / (radius**2 + RISE**2)
-        if np.any(model.parameters()[f"net/rod_bend_twist/{name}"] != value):
-            model.set_parameter("rod_bend_twist", name, value)
+def activated(strain: float, t: float) -> float:
+    """Return the natural strain that muscles have built up at a time [s], out of a whole one."""
+    return strain * np.sin(0.5 * np.pi * min(1.0, t / WINDS)) ** 2
 
 
 def observe(model, state) -> dict[str, float]:

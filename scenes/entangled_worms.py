@@ -49,22 +49,18 @@ def build(
     tight = np.stack([COIL * hand**0, RISE * hand]) / (COIL**2 + RISE**2)
     slack = LAY / (1.0 + LAY**2) / np.maximum(radius, SPACING) * np.stack([LAY * hand**2, hand])
 
-    def act(model, t: float) -> None:
-        activation = np.sin(0.5 * np.pi * min(1.0, t / WINDS)) ** 2
-        curvature, twist = ((1.0 - activation) * slack + activation * tight)[..., None]
-        wave = np.sin(2.0 * np.pi * (WAVES * np.arange(1, n) / n - t / PERIOD) + phases)
-        for name, values in (
-            ("rest_1", curvature * (1.0 + activation * AMPLITUDE * wave)),
-            ("rest_3", twist + 0.0 * wave),
-        ):
-            model.set_parameter("rod_bend_twist", name, values.ravel())
+    def activation(t: float) -> float:
+        return np.sin(0.5 * np.pi * min(1.0, t / WINDS)) ** 2
 
-    scene = ddg.Scene(
-        gravity=(0.0, 0.0, 0.0),
-        analysis=ddg.Dynamics(dt=dt, duration=duration),
-        initial=lambda model: act(model, 0.0) or model.state(),
-        callbacks=[lambda state: act(state.model, state.time)],
-    )
+    def curvature(t: float) -> np.ndarray:
+        grown = slack[0] + activation(t) * (tight - slack)[0]
+        wave = np.sin(2.0 * np.pi * (WAVES * np.arange(1, n) / n - t / PERIOD) + phases)
+        return grown[:, None] * (1.0 + activation(t) * AMPLITUDE * wave)
+
+    def twist(t: float) -> np.ndarray:
+        return (slack[1] + activation(t) * (tight - slack)[1])[:, None]
+
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), analysis=ddg.Dynamics(dt=dt, duration=duration))
     z = np.linspace(-0.5 * LENGTH, 0.5 * LENGTH, n + 1) / np.sqrt(1.0 + LAY**2)
     turned = (angle + hand * LAY * z[:, None] / np.maximum(radius, SPACING)).T
     out = np.stack([np.cos(turned), np.sin(turned), 0.0 * turned], axis=-1)
@@ -72,6 +68,8 @@ def build(
     scene.add_rods(
         points, section=ddg.Circle(RADIUS), material=FLESH, natural="straight", director=inwards, name="worms"
     )
+    scene.prescribe("curvature", "rod_bend_twist.rest_1", curvature)
+    scene.prescribe("twist", "rod_bend_twist.rest_3", twist)
     scene.contact(range=RANGE, friction=friction)
     return scene
 

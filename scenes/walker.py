@@ -10,6 +10,8 @@ Coulomb friction is no drag: with one coefficient for all directions a travellin
 reverse, along with the wave. A standing wave that is its own mirror image does not travel.
 """
 
+from functools import partial
+
 import numpy as np
 
 import ddg_warp as ddg
@@ -48,18 +50,17 @@ def build(
         steps: time steps in a period
         seed: seed of the initial jitter of crawlers; no jitter below 0
     """
-    scene = ddg.Scene(
-        analysis=ddg.Dynamics(dt=PERIOD / steps, duration=PERIODS * PERIOD),
-        initial=lambda model: actuate(model, 0.0) or model.state(),
-        callbacks=[lambda state: actuate(state.model, state.time)],
-    )
+    scene = ddg.Scene(analysis=ddg.Dynamics(dt=PERIOD / steps, duration=PERIODS * PERIOD))
     jitter = _many_rods.jitter((len(NAMES), 3), seed)
     x = np.linspace(0.0, LENGTH, n + 1)
     for k, name in enumerate(NAMES):
         shift = np.array([0.0, LANE * k, RADIUS + 1.01 * RANGE]) + jitter[k] * [0.01, 0.01, 5e-3 * RANGE]
         points = np.stack([x, 0.0 * x, 0.0 * x], axis=1) + shift
         rod = {"section": ddg.Circle(RADIUS), "material": MATERIAL, "director": (0.0, 1.0, 0.0), "name": name}
-        scene.add_rod(points, natural="straight", **rod)
+        crawler = scene.add_rod(points, natural="straight", **rod)
+        scene.prescribe(
+            f"muscles of {name}", "rod_bend_twist.rest_1", partial(curvature, name), rods=crawler, over="arc_length"
+        )
     scene.add_obstacle(ddg.Plane(), name="ground")
     scene.contact(range=RANGE, friction=across, velocity=VELOCITY)
     scene.contact_between(SNAKE, "ground", friction=(forwards, backwards, across))
@@ -73,13 +74,6 @@ def curvature(name: str, s: np.ndarray, t: float) -> np.ndarray:
     if name == STANDING:
         return CURVATURE * rise * np.cos(position) * np.sin(phase)
     return CURVATURE * rise * np.sin(position + phase)
-
-
-def actuate(model, t: float) -> None:
-    """Set the natural curvatures of all crawlers at a time [s]."""
-    s = LENGTH * np.arange(1, model.scene.batches[0].edges) / model.scene.batches[0].edges
-    values = np.concatenate([curvature(name, s, t) for name in NAMES])
-    model.set_parameter("rod_bend_twist", "rest_1", values)
 
 
 def observe(model, state) -> dict[str, float]:
