@@ -63,7 +63,7 @@ def critical_field(n: int, device: str = "cpu") -> float:
 def check(result) -> list[ddg.Check]:
     """Check the critical field and the tip of the buckled column."""
     n = len(result.state.points()) - 1
-    over = -result.scene.applied_field.value[2] * MAGNETISATION * AREA * LENGTH**2 / (EI * CRITICAL)
+    over = -result.scene.applied_field.value.at(0.0)[2] * MAGNETISATION * AREA * LENGTH**2 / (EI * CRITICAL)
     tolerance = min(ddg.Check.COARSEST, 1.0 / n**2)
     critical = critical_field(n, result.model.device)
     checks = [ddg.Check("critical field [EI / M A L^2]", critical, CRITICAL, tolerance, SOURCE, relative=True)]

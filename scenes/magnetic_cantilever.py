@@ -78,7 +78,7 @@ def tip(state) -> tuple[float, float, float]:
 
 def check(result) -> list[ddg.Check]:
     """Check the tip against the boundary value problem, and at a hundredth of the field against the linear beam."""
-    field = result.scene.applied_field.value
+    field = result.scene.applied_field.value.at(0.0)
     load = np.linalg.norm(field) * MAGNETISATION * AREA * LENGTH**2 / EI
     angle = float(np.arctan2(field[2], field[0]))
     n = len(result.state.points()) - 1

@@ -44,10 +44,9 @@ def build(n: int = 32) -> ddg.Scene:
     return rod(n, over_time(learn()["field"]))
 
 
-def over_time(values: np.ndarray):
+def over_time(values: np.ndarray) -> ddg.Samples:
     """Return the field as a function of time, from values at knots (knots, 3)."""
-    times = KNOT * np.arange(len(values))
-    return lambda t: tuple(np.interp(t, times, component) for component in values.T)
+    return ddg.Samples(values, times=KNOT * np.arange(len(values)))
 
 
 def rod(n: int, field=(0.0, 0.0, 0.0), analysis=None) -> ddg.Scene:

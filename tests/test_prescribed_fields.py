@@ -1,4 +1,4 @@
-"""Fields: rest strains that a scene prescribes over time and place, in steps, queries and equilibria."""
+"""Fields: rest strains that a scene prescribes over time and along rods, in steps, queries and equilibria."""
 
 import numpy as np
 import pytest
@@ -62,7 +62,7 @@ def set_on_arms(model, values: np.ndarray) -> None:
 
 @pytest.mark.parametrize("kind", ["uncoupled", "joined", "contact"])
 def test_field_equals_a_parameter_set_before_each_step(device, kind):
-    """A step uses the values at its end: bitwise for uncoupled rods, whose solver selection is the same."""
+    """The values at the end of a step act: bitwise for uncoupled rods, with equal solver selection."""
     model = scene_of(kind, values=wave, over="arc_length").build(device, "float64")
     actual, integrator = stepped(model)
     reference = scene_of(kind).build(device, "float64")
@@ -123,7 +123,7 @@ def test_steps_evaluate_at_the_end_or_the_middle_and_queries_at_the_time_of_a_st
 
 
 def test_fields_of_places(device):
-    """Arc lengths, positions and samples; a number, rods apart and all elements; closed rods and clamped ends."""
+    """Functions of arc length and position, samples, arrays by rod and by element, closed rods and clamped ends."""
     along = scene_of(values=lambda s, t: s, over="arc_length").build(device).fields.items["muscle"]
     assert along.shape == (RODS, NODES - 2)
     np.testing.assert_allclose(along.values.reshape(along.shape), np.tile(PLACES, (RODS, 1)))
@@ -214,10 +214,10 @@ def test_resumed_copied_and_reset_runs(device):
     for _ in range(3):
         state = integrator.step(state, DT)
     state = integrator.step(integrator.reset(state, [True, False]), DT)
-    late = scene.build(device, "float64")
-    start = late.state()
+    later = scene.build(device, "float64")
+    start = later.state()
     start.time = 3 * DT
-    np.testing.assert_allclose(state.points()[0], ddg.Integrator(late).step(start, DT).points(), rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(state.points()[0], ddg.Integrator(later).step(start, DT).points(), rtol=0.0, atol=1e-12)
 
 
 def test_growth_is_a_load(device):
@@ -225,10 +225,10 @@ def test_growth_is_a_load(device):
     kappa = 4.0 * np.pi / LENGTH
     grown = scene_of(values=lambda factor: factor * kappa)
     grown.gravity = (0.0, 0.0, 0.0)
-    model, way = grown.build(device, "float64"), []
-    end = statics.solve(model, load_steps=8, way=way)
-    assert len(way) == 8 and model.version == 0
-    for state in (way[3], end):  # edges of circles rotate by the natural curvature over their length
+    model, path = grown.build(device, "float64"), []
+    end = statics.solve(model, load_steps=8, way=path)
+    assert len(path) == 8 and model.version == 0
+    for state in (path[3], end):  # edges of circles rotate by the natural curvature over their length
         edges = np.diff(state.points().reshape(RODS, NODES, 3)[0], axis=0)
         cosine = (edges[1:-1] * edges[2:]).sum(1) / np.prod(
             [np.linalg.norm(e, axis=1) for e in (edges[1:-1], edges[2:])], 0
@@ -238,12 +238,14 @@ def test_growth_is_a_load(device):
         assert model.energies(state)["rod_bend_twist"] < 1e-12
     still = scene_of(values=0.0)
     still.gravity = (0.0, 0.0, 0.0)
-    given = statics.solve(still.build(device, "float64"), load_steps=8, controls=ddg.Controls(fields={"muscle": kappa}))
-    np.testing.assert_allclose(given.points(), end.points(), rtol=0.0, atol=1e-12)
+    controlled = statics.solve(
+        still.build(device, "float64"), load_steps=8, controls=ddg.Controls(fields={"muscle": kappa})
+    )
+    np.testing.assert_allclose(controlled.points(), end.points(), rtol=0.0, atol=1e-12)
 
 
 def test_bilayer_strip_rolls_up_in_one_call(device):
-    """A strip of two layers rolls up by 1.2 turns in eight load steps, as by `rest`."""
+    """A strip of two layers rolls up by 1.2 revolutions in eight load steps, as by `rest`."""
     flat, triangles = meshes.rectangle(30, 4, (0.1, 0.01), "alternating")
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     strip = scene.add_shell(flat, triangles, thickness=5e-4, material=ddg.Material(young=1e6, poisson=0.45))
@@ -273,7 +275,7 @@ def fails(t):
 
 
 def refused(call, *texts, error=ddg.SceneError):
-    """Assert that a call raises an error whose message has some texts."""
+    """Assert that a call raises an error with some texts in the message."""
     with pytest.raises(error) as caught:
         call()
     for text in texts:
@@ -322,7 +324,7 @@ def test_refusals(device):
     ],
 )
 def test_failing_functions_name_field_and_time(device, function, text):
-    """A step at which a function fails is refused, and the state before it goes on."""
+    """A failing function refuses the step, and the last state can be stepped further."""
     model = scene_of(values=function).build(device)
     integrator = ddg.Integrator(model)
     state = integrator.step(model.state(), DT)

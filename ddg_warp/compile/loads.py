@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ddg_warp import argument_checks
+from ddg_warp.scene.field import Field
 
 
 class Load:
@@ -28,9 +28,7 @@ class Load:
         Raises:
             SolverError: the amplitude is not finite; names the function and the time.
         """
-        return (
-            otherwise if self.amplitude is None else float(argument_checks.value_at("the amplitude", self.amplitude, t))
-        )
+        return float(Field("the amplitude", 1.0 if self.amplitude is None else self.amplitude).at(t, otherwise))
 
 
 @dataclass

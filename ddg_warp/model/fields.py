@@ -7,6 +7,7 @@ import numpy as np
 
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.model.rest_forms import rest_elements
 from ddg_warp.scene.field import PrescribedParameter
 
 ROD_TERMS = ("rod_stretch", "rod_bend_twist", "rod_bend", "planar_stretch", "planar_bend")
@@ -298,14 +299,17 @@ class ShellField:
         Raises:
             SolverError: the shell has no such form, or a metric without area.
         """
-        from ddg_warp.model.rest_shapes import set_rest
-
         if self._written is not None and np.array_equal(self._written, self.values):
             return
         try:
-            set_rest(self._model, self.description.shell, prescribed=True, **{self.description.parameter: self.values})
+            plate, elements = rest_elements(
+                self._model, self.description.shell, {self.description.parameter: self.values}
+            )
         except ValueError as reason:
             raise _refusal(error, f"{self.description.field.label}: {reason}") from None
+        self._model.coupled.host.shells[self.description.shell].plate = plate
+        for part, first, parameters in elements:
+            part.write_rest(first, parameters)
         self._written = np.array(self.values)
 
 

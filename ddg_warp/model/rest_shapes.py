@@ -6,15 +6,13 @@ every shape (Efrati, Sharon, Kupferman 2009). `Model.set_rest` changes them; `Sc
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
 from ddg_warp import argument_checks
-from ddg_warp.compile import shells
-from ddg_warp.geometry import fundamental_forms
-from ddg_warp.geometry.surface import DEGENERATE, Surface
+from ddg_warp.geometry.surface import Surface
 from ddg_warp.model.model import check_model
+from ddg_warp.model.rest_forms import rest_elements
 
 
 def principal_form(points, triangles, first, second=0.0, direction=(1.0, 0.0, 0.0)) -> np.ndarray:
@@ -98,57 +96,18 @@ def bilayer_curvature(mismatch: float, h1: float, h2: float, young1: float = 1.0
     return 6.0 * mismatch * (1.0 + m) ** 2 / (h * (3.0 * (1.0 + m) ** 2 + (1.0 + m * n) * (m**2 + 1.0 / (m * n))))
 
 
-def set_rest(
-    model, shell: int, *, points=None, metric=None, curvature=None, angle=None, plate=None, prescribed: bool = False
-) -> None:
-    """Set the rest shape of a shell; see `Model.set_rest`.
-
-    Args:
-        plate: stored values of its `Plate` by name.
-        prescribed: True to write to existing memory without a new version of the model, for fields.
-    """
+def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, angle=None, plate=None) -> None:
+    """Set the rest shape of a shell; see `Model.set_rest`. `plate`: stored values of its `Plate` by name."""
     check_model("set_rest", model)
     if model.coupled is None or not 0 <= argument_checks.index("set_rest: shell", shell) < len(
         model.coupled.host.shells
     ):
         count = 0 if model.coupled is None else len(model.coupled.host.shells)
         raise ValueError(f"shell {shell} does not exist; the model has {count} shells")
-    coupled_shell, bending = model.coupled.host.shells[shell], model.scene.shells[shell].bending
-    membrane = model.scene.shells[shell].membrane
-    surface, changes = coupled_shell.surface, dict(plate or {})
-    count = len(surface.triangles)
-    if not changes and all(values is None for values in (points, metric, curvature, angle)):
-        raise ValueError("set_rest: give points, metric, curvature or angle")
-    if bending == "isometric":
-        raise ValueError("bending 'isometric' keeps its flat rest shape; use 'midedge_dof' or 'hinge'")
-    if points is not None:
-        points = _shaped("points", points, surface.points.shape)
-        _refuse_without_area("points", fundamental_forms.metric(surface, points))
-        changes["abar"] = fundamental_forms.metric(surface, points)
-        changes["bbar"] = fundamental_forms.second_form(surface, points, coupled_shell.kinds)
-        changes["angle"] = fundamental_forms.edge_angles(surface, points, coupled_shell.kinds)
-    if metric is not None:
-        changes["abar"] = _shaped("metric", metric, (count, 3))
-        _refuse_without_area("metric", changes["abar"])
-    if curvature is not None:
-        if bending not in ("midedge_dof", "midedge"):
-            raise ValueError(f"bending {bending!r} has no rest curvature of a triangle; give the angles of its edges")
-        changes["bbar"] = _shaped("curvature", curvature, (count, 3))
-    if angle is not None:
-        if bending != "hinge":
-            raise ValueError(f"bending {bending!r} has no rest angles; give a curvature, or the points of a rest shape")
-        angle = _shaped("angle", angle, (len(surface.edges),))
-        changes["angle"] = np.repeat(angle[:, None], 2, axis=1)
-    plate = replace(coupled_shell.plate, **changes)
-    sets = {part.term.law: part for part in model.coupled.sets}
-    elements_of = shells.shell_elements(surface, plate, coupled_shell.kinds, bending, membrane)
-    places = [(sets[e.term.law], coupled_shell.first[e.term.name], e.parameters) for e in elements_of if len(e)]
-    coupled_shell.plate = plate  # nothing can fail after this
-    if prescribed:
-        for part, first, parameters in places:
-            part.write_rest(first, parameters)
-        return
-    model.note_change(any([part.set_rest(first, parameters) for part, first, parameters in places]))
+    forms = {"points": points, "metric": metric, "curvature": curvature, "angle": angle}
+    plate, elements = rest_elements(model, shell, forms, plate)
+    model.coupled.host.shells[shell].plate = plate  # nothing can fail after this
+    model.note_change(any([part.set_rest(first, parameters) for part, first, parameters in elements]))
 
 
 def set_rest_strains(model, strains: dict) -> None:
@@ -191,21 +150,6 @@ def set_rest_strains(model, strains: dict) -> None:
         values = np.broadcast_to(values, (model.worlds, count))
         updates += [(group, name, np.concatenate(values[:, numbers], axis=1)) for group, _, numbers in groups]
     model.note_change(any([group.parameters.set(**{name: values}) for group, name, values in updates]))
-
-
-def _refuse_without_area(name: str, metric: np.ndarray) -> None:
-    a11, a12, a22 = metric.T
-    for t in np.flatnonzero((a11 <= 0.0) | (a11 * a22 - a12**2 <= DEGENERATE**2 * (a11 + a22) ** 2))[:1]:
-        text = f"set_rest: {name} give triangle {t} no area: the metric of triangle {t} is {metric[t]}"
-        raise ValueError(f"{text}; a11 > 0 and a11 a22 > a12^2")
-
-
-def _shaped(name: str, values, shape: tuple) -> np.ndarray:
-    values = argument_checks.array(name, values, f"give finite numbers of shape {shape}")
-    if values.shape != shape or not np.isfinite(values).all():
-        raise ValueError(f"{name} has shape {values.shape}; give finite numbers of shape {shape}")
-    argument_checks.sized(name, values)
-    return values
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

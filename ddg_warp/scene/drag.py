@@ -8,6 +8,7 @@ import numpy as np
 
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.scene.field import Field
 
 # c_t and c_n of `Viscous`
 THEORIES = {
@@ -156,11 +157,7 @@ def flow_at(scene, t: float, error=SolverError) -> np.ndarray:
     Raises:
         error: the flow is not finite, or leaves the plane of a planar scene; names the function and the time.
     """
-    flow = (
-        argument_checks.value_at("flow", scene.flow, t, 3, error)
-        if callable(scene.flow)
-        else np.array(scene.flow, float)
-    )
+    flow = Field("flow", scene.flow, 3).at(t, error=error)
     if flow.shape != (3,):
         raise error(f"flow has shape {flow.shape} at t = {t:g}; it is uniform, give (3,)")
     if scene.dimension == 2 and flow[1] != 0.0:

@@ -6,6 +6,7 @@ import numpy as np
 
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.scene.field import Field
 
 
 @dataclass(frozen=True)
@@ -21,8 +22,8 @@ class Magnet:
 class MagneticField:
     """Applied field B(x, t) = value + gradient (x - origin) [T]: constants, or functions of time."""
 
-    value: object
-    gradient: object
+    value: Field
+    gradient: Field
     origin: np.ndarray
     planar: bool  # whether the field must lie in the plane of x and z
 
@@ -32,12 +33,7 @@ class MagneticField:
         Raises:
             SolverError: a function is not finite, or no magnetic field; names the function and the time.
         """
-        value, gradient = (
-            argument_checks.value_at(f"the magnetic {label}", source, t, 3, error)
-            if callable(source)
-            else otherwise * source
-            for label, source in (("field", self.value), ("field's gradient", self.gradient))
-        )
+        value, gradient = (field.at(t, otherwise, error) for field in (self.value, self.gradient))
         self._check(value, gradient, t, error)
         return np.concatenate([value - gradient @ self.origin, gradient.ravel()])
 
@@ -139,6 +135,7 @@ class Magnets:
         if not callable(gradient):
             gradient = np.zeros((3, 3)) if gradient is None else gradient
             gradient = argument_checks.broadcast("magnetic_field: gradient", gradient, (3, 3), own=2)
+        value, gradient = Field("the magnetic field", value, 3), Field("the magnetic field's gradient", gradient, 3)
         applied = MagneticField(value, gradient, origin, self.dimension == 2)
         applied.at(0.0, 1.0, SceneError)
         self.applied_field = applied

@@ -50,40 +50,40 @@ def difference(loss, value: torch.Tensor, direction: torch.Tensor, h: float = 1e
     ],
 )
 def test_gradients_of_steps(kind, scheme):
-    """By an amplitude of every step, by values along rods and by worlds; the version of the models stays."""
+    """Gradients by the amplitude of every step and by values along rods, with worlds; versions of models stay."""
     made = simulator(kind, scheme)
     item = made.model.fields.items["muscle"]
-    start, apart = made.initial_state(WORLDS), torch.tensor([[1.0], [0.5]], dtype=torch.float64)
+    start, of_worlds = made.initial_state(WORLDS), torch.tensor([[1.0], [0.5]], dtype=torch.float64)
 
     def loss(amplitude, along):
         states = made.rollout(
-            start, None, lambda k: {"fields": {"muscle": amplitude[k] * along * apart}}, steps=STEPS, save=STEPS
+            start, None, lambda k: {"fields": {"muscle": amplitude[k] * along * of_worlds}}, steps=STEPS, save=STEPS
         )
         return (states[-1].positions[..., 2] ** 2).sum() + states[-1].positions[0, 5, 0]
 
     amplitude, along = (2.0 * random(STEPS)).requires_grad_(), (1.0 + 0.3 * random(item.size, seed=1)).requires_grad_()
     by_amplitude, by_along = torch.autograd.grad(loss(amplitude, along), (amplitude, along))
-    for gradient, direction, of in (
+    for gradient, direction, loss_by in (
         (by_amplitude, random(STEPS, seed=2), lambda x: loss(x, along)),
         (by_along, random(item.size, seed=3), lambda x: loss(amplitude, x)),
     ):
         value = amplitude if gradient is by_amplitude else along
-        expected = difference(of, value.detach(), direction)
+        expected = difference(loss_by, value.detach(), direction)
         assert float((gradient * direction).sum()) == pytest.approx(expected, rel=2e-5)
     assert made.model.version == made.engine(WORLDS).model.version == 0
 
 
 def test_tensors_equal_controls_and_end_with_the_step():
-    """Steps equal those of an integrator with `Controls`; without tensors the scene's values act again, in the reverse too."""
+    """Tensors act as `Controls` of an integrator, for one step; then the scene's values act again, in the reverse, too."""
     made = simulator("joined", values=lambda t: 1.0 + 20.0 * t)
     integrator, state = ddg.Integrator(made.model, rtol=1e-11), made.model.state()
     integrator.step_whole()
-    now = made.initial_state(1)
-    for given in (0.7, None, -0.4, None):
-        fields = None if given is None else {"muscle": given}
-        state = integrator.step(state, DT, None if given is None else ddg.Controls(fields=fields))
-        now = made.step(now, None, None if given is None else {"fields": fields})
-        np.testing.assert_allclose(now.positions[0].numpy(), state.points(), rtol=0.0, atol=1e-13)
+    state_by_torch = made.initial_state(1)
+    for curl in (0.7, None, -0.4, None):
+        fields = None if curl is None else {"muscle": curl}
+        state = integrator.step(state, DT, None if curl is None else ddg.Controls(fields=fields))
+        state_by_torch = made.step(state_by_torch, None, None if curl is None else {"fields": fields})
+        np.testing.assert_allclose(state_by_torch.positions[0].numpy(), state.points(), rtol=0.0, atol=1e-13)
     start = made.initial_state(1)
     value = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
 
