@@ -28,6 +28,7 @@ SMALL = {
     "flagellum": {"n": 25, "steps": 50},
     "flying_beam": {"n": 20},
     "greenhill": {"n": 100},
+    "growing_strip": {},
     "gridshell_dome": {"rods": 3},
     "hair": {"strands": 16},
     "hair_combed": {"gaps": 2, "rows": 2, "n": 24},
