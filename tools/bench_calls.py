@@ -4,7 +4,7 @@
     python tools/bench_calls.py --against FILE [--cuda] [--out DIR] with those of another version, measured just before: a table
 
 Four rods of 12 nodes with a grip each, 0.005 s a step: uncoupled, joined, or with contact. `step`: of an integrator. `set`: with a
-parameter change before each step. `worlds`: of 1,024 worlds. `torch`: a step of a `Simulator` without gradients, of 64 worlds.
+parameter change before each step. `field`: with a natural curvature that is a function of arc length and time. `worlds`: of 1,024 worlds. `torch`: a step of a `Simulator` without gradients, of 64 worlds.
 `parameter`, `poses`: with a tensor for every world. `forward`, `backward`: of roll-outs of ten steps with both. `error`: relative
 error of the gradient by the parameter against central differences. Times are the least of several runs of consecutive calls, with
 one device synchronisation at the end. To compare versions alternate both on one machine.
@@ -85,6 +85,16 @@ def plain(kind: str, model, clock):
         integrator.step(state, DT)
 
     yield {"kind": kind, "call": "set", "ms": clock(change), "error": ""}
+    driven = scene_of(kind)
+    driven.prescribe("muscle", "rod_bend_twist.rest_1", lambda s, t: 1e-3 * np.sin(s - t), rods=range(4), over="arc_length")
+    muscle = ddg.Integrator(driven.build(model.device, "float64"))
+    start = muscle.model.state()
+
+    def drive():
+        start.time += DT  # else values stay
+        muscle.step(start, DT)
+
+    yield {"kind": kind, "call": "field", "ms": clock(drive), "error": ""}
 
 
 def gradients(kind: str, model, clock):
@@ -137,6 +147,7 @@ def main() -> None:
         write_json(options.json, results)
     if options.against:
         before = {(row["kind"], row["call"]): row for row in json.loads(options.against.read_text())}
+        results = [row for row in results if (row["kind"], row["call"]) in before]
         for row in results:
             old = before[row["kind"], row["call"]]["ms"]
             row |= {"ms before": old, "ratio": row["ms"] / old}

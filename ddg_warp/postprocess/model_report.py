@@ -55,6 +55,10 @@ def report(model) -> str:
             lines += contact_lines(contact_parameters)
             lines += [f"  {each.name}: {each.density.name}, {each.text}" for each in potentials]
             present |= {each.name for each in potentials}
+    for name, item in model.fields.items.items():
+        each = item.description
+        owner = f"{len(each.rods)} rods" if each.shell is None else f"shell {each.shell}"
+        lines.append(f"field '{name}': {each.parameter} of {owner}" + ("" if each.field.constant else ", a function"))
     bare = dict.fromkeys(batch.name for batch in model.scene.batches if batch.section.radius is None)
     if bare:
         lines.append(f"drawn {2.0 * DRAWN:g} m thick, as their section has no radius: {', '.join(bare)}")
