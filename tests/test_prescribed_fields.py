@@ -263,6 +263,8 @@ def test_bilayer_strip_rolls_up_in_one_call(device):
     angle = np.unwrap(np.arctan2(edges[:, 2], edges[:, 0]))
     assert abs(angle[-1] - angle[0]) > 2.0 * np.pi * 1.2
     assert end.stable and model.version == 0
+    with pytest.raises(ValueError, match="field 'swelling'"):
+        model.set_rest(strip, points=flat)
     expected = statics.solve(
         bare.build(device, "float64"), load_steps=8, rest={strip: {"curvature": curled, "metric": grown}}
     )
@@ -309,6 +311,7 @@ def test_refusals(device):
     refused(
         lambda: rest_shapes.set_rest_strains(model, {CURL: np.zeros(2 * (NODES - 2))}), "'muscle'", error=ValueError
     )
+    refused(lambda: statics.solve(model, rest={0: {"curvature": 1.0}}), "rest[0]", "field 'muscle'")
     refused(lambda: ddg.Samples([1.0, 2.0], times=[1.0, 0.0]), "times")
     refused(lambda: ddg.Samples([1.0, 2.0, 3.0], times=[0.0, 1.0]), "values have shape (3,)")
     moving = scene_of(values=lambda t: t).build(device)

@@ -4,10 +4,11 @@
     python tools/bench_calls.py --against FILE [--cuda] [--out DIR] with those of another version, measured just before: a table
 
 Four rods of 12 nodes with a grip each, 0.005 s a step: uncoupled, joined, or with contact. `step`: of an integrator. `set`: with a
-parameter change before each step. `field`: with a natural curvature that is a function of arc length and time. `worlds`: of 1,024 worlds. `torch`: a step of a `Simulator` without gradients, of 64 worlds.
-`parameter`, `poses`: with a tensor for every world. `forward`, `backward`: of roll-outs of ten steps with both. `error`: relative
-error of the gradient by the parameter against central differences. Times are the least of several runs of consecutive calls, with
-one device synchronisation at the end. To compare versions alternate both on one machine.
+parameter change before each step. `field`: with a natural curvature that is a function of arc length and time. `worlds`: of 1,024
+worlds. `torch`: a step of a `Simulator` without gradients, of 64 worlds. `parameter`, `poses`: with a tensor for every world.
+`forward`, `backward`: of roll-outs of ten steps with both. `error`: relative error of the gradient by the parameter against central
+differences. Times are the least of several runs of consecutive calls, with one device synchronisation at the end. To compare
+versions alternate both on one machine.
 """
 
 import argparse
@@ -86,7 +87,9 @@ def plain(kind: str, model, clock):
 
     yield {"kind": kind, "call": "set", "ms": clock(change), "error": ""}
     driven = scene_of(kind)
-    driven.prescribe("muscle", "rod_bend_twist.rest_1", lambda s, t: 1e-3 * np.sin(s - t), rods=range(4), over="arc_length")
+    driven.prescribe(
+        "muscle", "rod_bend_twist.rest_1", lambda s, t: 1e-3 * np.sin(s - t), rods=range(4), over="arc_length"
+    )
     muscle = ddg.Integrator(driven.build(model.device, "float64"))
     start = muscle.model.state()
 

@@ -90,14 +90,14 @@ class Fields:
         for shell in self._shells:
             shell.forget()
 
-    def refuse(self, call: str, parameter: str) -> None:
-        """Refuse to change a parameter "term.parameter" that a field prescribes.
+    def refuse(self, call: str, parameter: str, shell: int | None = None) -> None:
+        """Refuse to change a parameter "term.parameter", or a form of a shell, that a field prescribes.
 
         Raises:
             ValueError: names the field.
         """
         for name, item in self.items.items():
-            if item.description.parameter == parameter:
+            if (item.description.parameter, item.description.shell) == (parameter, shell):
                 raise ValueError(
                     f"{call}: {parameter} is prescribed by the field '{name}'; give Controls(fields={{{name!r}: ...}}) to steps"
                 )

@@ -12,7 +12,7 @@ import numpy as np
 from ddg_warp import argument_checks
 from ddg_warp.geometry.surface import Surface
 from ddg_warp.model.model import check_model
-from ddg_warp.model.rest_forms import rest_elements
+from ddg_warp.model.rest_forms import FORMS, rest_elements
 
 
 def principal_form(points, triangles, first, second=0.0, direction=(1.0, 0.0, 0.0)) -> np.ndarray:
@@ -105,6 +105,8 @@ def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, ang
         count = 0 if model.coupled is None else len(model.coupled.host.shells)
         raise ValueError(f"shell {shell} does not exist; the model has {count} shells")
     forms = {"points": points, "metric": metric, "curvature": curvature, "angle": angle}
+    for form in FORMS if points is not None else [form for form in FORMS if forms[form] is not None]:
+        model.fields.refuse("set_rest", form, shell)
     plate, elements = rest_elements(model, shell, forms, plate)
     model.coupled.host.shells[shell].plate = plate  # nothing can fail after this
     model.note_change(any([part.set_rest(first, parameters) for part, first, parameters in elements]))

@@ -36,6 +36,11 @@ class TermParameterView:
         self.weighs = False
 
     @property
+    def prescribed(self) -> bool:
+        """True if a field of the scene prescribes the parameter."""
+        return self.name in self.memory.prescribed
+
+    @property
     def shape(self) -> tuple[int, int]:
         """Shape of the tensors written."""
         worlds, elements = self.model.worlds, self.elements

@@ -40,10 +40,10 @@ class ParameterTensors:
                 if name in named_parameters.NAMES
                 else self._of_terms(name)
             )
-            try:
-                self.model.fields.refuse("parameters", name)
-            except ValueError as error:
-                raise SceneError(str(error)) from None
+            if any(isinstance(view, TermParameterView) and view.prescribed for view in storage[1]):
+                raise SceneError(
+                    f"parameters: {name} is prescribed by a field of the scene; give controls={{'fields': {{name: tensor}}}}"
+                )
             if not storage[1]:
                 raise SceneError(f"parameters: no object has {name!r}; this model has {', '.join(self.names())}")
             self._found[name] = storage

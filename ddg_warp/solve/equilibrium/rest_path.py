@@ -105,6 +105,11 @@ class RestPath:
             target_values = argument_checks.broadcast(f"statics: rest[{key!r}][{strain_key!r}]", values, shape).reshape(
                 count, -1
             )
+            for name in names:
+                try:
+                    self.model.fields.refuse(f"statics: rest[{key!r}]", f"{term.name}.{name}")
+                except ValueError as error:
+                    raise SceneError(str(error)) from None
             start = {name: read(f"{term.name}.{name}") for name in names}
             self._changes.append((write, start, {name: target_values[:, i] for i, name in enumerate(names)}))
 
