@@ -4,6 +4,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from ddg_warp.kernels.core import outcome
 from ddg_warp.solve.forces.control_loads import LOADS
 from ddg_warp.solve.forces.prescribed_motion import counts_revolutions, rotations_between
 from ddg_warp.torch.state_layout import view
@@ -72,15 +73,17 @@ class StepControls:
             target.zero_()
 
     def give_fields(self, t: float, controls: dict) -> None:
-        """Write the fields at a time to parameter memory: of the scene, then tensors."""
-        fields = self.model.fields
+        """Write the fields at a time to parameter memory, of the scene, then tensors; worlds that are not finite are invalid."""
+        fields, tables = self.model.fields, self.engine.tables
         if self._has_tensors:
             fields.forget()
+            tables.find_invalid()
         fields.to(t)
         self._has_tensors = False
         for name, value in controls.items():
             if name.startswith(FIELD):
                 self._has_tensors = True
+                tables.invalid.masked_fill_(~torch.isfinite(value).all(1), outcome.INVALID_INPUT)
                 for part, row, size, indices, elements in self._storage(name):
                     table = part.parameters
                     memory = view(table.buffer).narrow(0, table.offsets[row], size)

@@ -169,7 +169,7 @@ class ParameterTensors:
                 entries[0][0].put(entries)
                 self._written[key], changed = kept, True
         if changed:
-            self._judge()
+            self.find_invalid()
 
     def restore(self) -> None:
         """Restore all written parameters to the values of the model."""
@@ -195,7 +195,7 @@ class ParameterTensors:
     def _name_of(self, place) -> str:
         return next(name for name, (_, places) in self._found.items() if any(storage is place for storage in places))
 
-    def _judge(self) -> None:
+    def find_invalid(self) -> None:
         """Find the worlds with NaN in a written parameter."""
         self.invalid.zero_()
         for entries in self._written.values():
