@@ -74,7 +74,6 @@ TESTED_BY = {
     "solve/newton/frozen_hessian": ("test_tolerance.py", "projective"),
     "solve/stepping": ("test_coupled_steps.py", "Integrator"),
     "solve/stepping/energy_drift": ("test_midpoint_energy.py", "drift"),
-    "solve/stepping/graph_cache": ("test_state_buffers.py", "capture"),
     "solve/stepping/local_error": ("test_step_control.py", "error"),
     "solve/stepping/world_reset": ("test_resets.py", "reset"),
 }

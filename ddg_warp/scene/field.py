@@ -141,7 +141,7 @@ class Fields:
         Args:
             name: name of the field, as in `Controls(fields={name: values})`, which replaces its values for a step.
             parameter: "term.parameter", such as "rod_bend_twist.rest_1" (curvature 1 [1/m]), "rod_bend_twist.rest_3" (twist
-                [1/m]), "planar_bend.rest_1" (curvature) or "rod_stretch.rest" [1]. Of a shell "metric", "curvature" or "angle", with
+                [1/m]), "planar_bend.rest" (curvature) or "rod_stretch.rest" [1]. Of a shell "metric", "curvature" or "angle", with
                 values as of `Model.set_rest`.
             values: one number, an array, or a function that returns a number or an array. Arrays broadcast to (elements,) of one
                 rod, or to (rods, elements) of rods with equally many elements. Of other rods they are (all elements,), rod after
