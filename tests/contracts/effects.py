@@ -320,6 +320,7 @@ CALLS["Grip"] = Call(ddg.Grip, lambda **named: observe_motion(ddg.Grip(**named),
 CURL = {"name": "curl", "parameter": "rod_bend_twist.rest_1", "values": 1.0}
 scene_call("prescribe", CURL, {
     "name": Change("", refused=True), "parameter": "rod_bend_twist.rest_2", "values": 2.0, "rods": [1],
+    "shell": Change(0, refused=True),
     "over": Change("arc_length", {"values": lambda *where: np.size(where[0])})}, two_rods)  # fmt: skip
 
 
