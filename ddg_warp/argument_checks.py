@@ -360,7 +360,7 @@ def value_at(
         raise _refusal(error, f"{text}; make it defined from t = 0 on") from reason
     if type(result) in (float, np.float64) and not columns and abs(result) <= MOST:  # fast paths, taken every step
         return np.asarray(result)
-    if columns is None and type(result) is np.ndarray and result.dtype == float and result.size:
+    if columns is None and type(result) is np.ndarray and result.dtype.char == "d" and result.size:
         flat = result.reshape(-1)
         if flat @ flat <= MOST**2:
             return result

@@ -24,6 +24,7 @@ class ParameterTable:
         """Upload values by name; `along` is the axis of elements, 0 or 1."""
         self.values, self._along, self._real, self._device = dict(values), along, real, device
         self.version, self.foreign, self.prescribed = 0, set(), set()
+        self._is_cuda = wp.get_device(device).is_cuda
         self._target, self._staging = (None, None), {}  # buffer and its view; pinned arrays by name
         self.upload()
 
@@ -48,7 +49,7 @@ class ParameterTable:
         updates = {name: _spread(np.asarray(new, float), self.values[name].shape) for name, new in values.items()}
         self.version += 1
         fits = all(new.shape == self.values[name].shape for name, new in updates.items())
-        self.values |= updates
+        self.values |= {name: np.array(new) if name in self.prescribed else new for name, new in updates.items()}
         if not fits:
             self.upload()
             return True
@@ -69,14 +70,11 @@ class ParameterTable:
         Args:
             entries: (flat indices, values) each.
         """
-        values = self.values[name]
-        if not values.flags.writeable:
-            values = self.values[name] = values.copy()
-        values = values.reshape(-1)
+        values = self.values[name].reshape(-1)
         for indices, entry in entries:
             values[indices] = entry
         offset = self.offsets[name]
-        if self.buffer.device.is_cuda:
+        if self._is_cuda:
             if name not in self._staging:
                 self._staging[name] = _Staging(values.size, self._real, self.buffer.device)
             self._staging[name].copy(values, self.buffer, offset)
