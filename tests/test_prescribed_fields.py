@@ -7,6 +7,7 @@ import ddg_warp as ddg
 from ddg_warp import rest_shapes, statics
 from ddg_warp.geometry import meshes
 from ddg_warp.model.parameters import ParameterTable
+from ddg_warp.solve.equilibrium.dynamic_relaxation import relax
 from ddg_warp.solve.stepping.graph_cache import Graphs
 
 RODS, NODES, LENGTH, DT = 2, 11, 0.5, 0.01
@@ -236,6 +237,8 @@ def test_growth_is_a_load(device):
         turning = 2.0 * np.arctan(0.5 * kappa * state.time * LENGTH / (NODES - 1))
         np.testing.assert_allclose(np.arccos(cosine), turning, rtol=1e-8)
         assert model.energies(state)["rod_bend_twist"] < 1e-12
+    half = relax(model, path[3], at=0.5)
+    np.testing.assert_allclose(half.points(), path[3].points(), rtol=0.0, atol=1e-4)
     still = scene_of(values=0.0)
     still.gravity = (0.0, 0.0, 0.0)
     controlled = statics.solve(

@@ -40,6 +40,7 @@ def relax(
         raise SceneError("contact: dynamic relaxation has no contact; use statics.solve, which has")
     equilibrium = Equilibrium(model, StaticsOptions())
     tangent = equilibrium.tangent
+    model.fields.to(at)
     state = tangent.with_prescribed((state or model.state()).copy(), at)
     state.time = at
     lever = np.where(tangent.angle, tangent.edge_length(), 1.0)
