@@ -237,8 +237,8 @@ def test_growth_is_a_load(device):
         turning = 2.0 * np.arctan(0.5 * kappa * state.time * LENGTH / (NODES - 1))
         np.testing.assert_allclose(np.arccos(cosine), turning, rtol=1e-8)
         assert model.energies(state)["rod_bend_twist"] < 1e-12
-    half = relax(model, path[3], at=0.5)
-    np.testing.assert_allclose(half.points(), path[3].points(), rtol=0.0, atol=1e-4)
+    half = relax(model, path[2], at=0.5, residual=1e-5)  # from the equilibrium at 3/8
+    np.testing.assert_allclose(half.points(), path[3].points(), rtol=0.0, atol=1e-3)
     still = scene_of(values=0.0)
     still.gravity = (0.0, 0.0, 0.0)
     controlled = statics.solve(
