@@ -14,23 +14,9 @@ from ddg_warp.model.state import query
 from ddg_warp.postprocess import end_moments
 from ddg_warp.solve.equilibrium.tangent import Tangent
 from ddg_warp.solve.forces.drag import CoupledDrag, RodGroupDrag
+from ddg_warp.solve.stepping.wrenches import Reaction
 
 TWIST = 2  # index of the twist among the strains of rod vertices and of half cells at joints
-
-
-@dataclass(frozen=True)
-class Reaction:
-    """Reaction of one support of the scene: resultant force and moment.
-
-    Attributes:
-        force: (3,) or (worlds, 3) [N].
-        moment: about `point` (3,) or (worlds, 3) [N m].
-        point: (3,) or (worlds, 3) [m].
-    """
-
-    force: np.ndarray
-    moment: np.ndarray
-    point: np.ndarray
 
 
 @launches

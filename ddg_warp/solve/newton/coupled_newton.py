@@ -125,7 +125,7 @@ class CoupledNewton:
             self.updated_islands.needs_direction,
             None if repeats or self.exact else self.islands.drop_compression,
         )
-        self._residual = ResidualAssembler(
+        self.residual = ResidualAssembler(
             coupled,
             self.elements,
             self.sparsity,
@@ -198,7 +198,7 @@ class CoupledNewton:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        parts = (self._residual, self.tolerances, self.line_search, self._worst, self.elements, self._assembly)
+        parts = (self.residual, self.tolerances, self.line_search, self._worst, self.elements, self._assembly)
         parts += (
             self.frozen,
             self.substructuring,
@@ -267,7 +267,7 @@ class CoupledNewton:
     def balance(self) -> None:
         """Compute residuals, the change of the energy, and the worlds that are out of equilibrium."""
         system, islands = self.system, self.islands
-        self._residual(self.iterates, self.loading, self.norms, system, islands)
+        self.residual(self.iterates, self.loading, self.norms, system, islands)
         flags = islands.not_converged, islands.below_rounding_floor
         self.tolerances.sum_up(system.rhs, self.options.rtol, islands, *flags, self.exact and not self.frozen)
 

@@ -18,6 +18,9 @@ class ResidualAssembler:
         tolerances: `ResidualTolerances`, whose ratios of blocks and rounding floors are written.
         rtol: relative tolerance; floor: rounding floor over the rounding bound.
         drag: True if blocks have more than a mass.
+
+    Attributes:
+        inputs: arrays of the last residual, see `kernels.residual.coupled_residual.inputs_type`.
     """
 
     def __init__(
@@ -36,7 +39,7 @@ class ResidualAssembler:
     ):
         self.coupled, host, real, lengths = coupled, coupled.host, coupled.real, coupled.host.edge_lengths
         self.bands = substructuring.bands if substructuring and substructuring.banded else None
-        self._inputs = inputs = coupled_residual.inputs_type(real, drag)()
+        self.inputs = inputs = coupled_residual.inputs_type(real, drag)()
         self._outputs = outputs = coupled_residual.results_type(real, linear)()
         inputs.arm, inputs.longest, inputs.settled = lengths.mean(), lengths.max(), SETTLED * host.bodies.shortest
         inputs.blocks, inputs.nodes, inputs.rtol, inputs.rounding_factor = (
@@ -65,7 +68,7 @@ class ResidualAssembler:
 
     def __call__(self, iterates, loading, norms, system, islands) -> None:
         """Assemble the residuals at the iterate, with norms."""
-        inputs, outputs, total = self._inputs, self._outputs, self.coupled.worlds * self._count
+        inputs, outputs, total = self.inputs, self._outputs, self.coupled.worlds * self._count
         inputs.q, inputs.base, inputs.target = iterates.proposed, iterates.base, iterates.target
         inputs.mass, inputs.gravity, inputs.load = loading.mass, loading.gravity, loading.force
         inputs.fixed, outputs.rhs = system.masks.fixed, system.rhs

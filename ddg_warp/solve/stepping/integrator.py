@@ -25,6 +25,7 @@ from ddg_warp.solve.stepping.local_error import VelocityChange
 from ddg_warp.solve.stepping.rod_step import RodStep
 from ddg_warp.solve.stepping.state_buffers import StateBuffer
 from ddg_warp.solve.stepping.world_reset import WorldReset, outcomes
+from ddg_warp.solve.stepping.wrenches import Reaction, Wrenches
 from ddg_warp.timers import timer
 
 FAILURES = ("raise", "flag")
@@ -81,6 +82,7 @@ class Integrator:
 
     Attributes:
         whole: True if rods out of contact are solved in the coupled system regardless; see `step_whole`.
+        watched_wrenches: wrenches of the last step on the device; None unless `watch_wrenches` was called.
 
     Raises:
         SceneError: a free node has neither mass nor drag along and across its rod; the scheme is unknown, or implicit Euler has an
@@ -140,6 +142,7 @@ class Integrator:
         self._dt_host = None
         self._longest, self._version = 0.0, model.version
         self._changes: VelocityChange | None = None
+        self.watched_wrenches: Wrenches | None = None
         self._gyroscope: Gyroscope | None = None  # made on first use
         self._spinning = False  # True if the current step has gyroscopic couples
         self._doubted = False  # True once the rounding warning is issued
@@ -448,6 +451,25 @@ class Integrator:
             self._graphs.clear()
         return self._changes
 
+    def watch_wrenches(self) -> Wrenches:
+        """Return the wrenches of steps on the device, evaluated from the next step on."""
+        if self.watched_wrenches is None:
+            self.watched_wrenches = Wrenches(self.model)
+            self._graphs.clear()
+        return self.watched_wrenches
+
+    def wrenches(self) -> list[Reaction]:
+        """Return the force and moment that every support, grip and obstacle exerted in the last step. Reads from the device.
+
+        They are ordered as those of `Model.reactions`, and hold inertia, damping, drag and loads at the support; see `Wrenches`.
+
+        Raises:
+            SceneError: `watch_wrenches` was not called before the step.
+        """
+        if self.watched_wrenches is None:
+            raise SceneError("wrenches: they are evaluated within steps; call integrator.watch_wrenches() before the step")
+        return self.watched_wrenches.values()
+
     def forget(self) -> None:
         """Reset energy accounts and failed worlds, for a state from outside."""
         for part in self._parts:
@@ -464,6 +486,9 @@ class Integrator:
     def _launch(self, source: int) -> None:
         """Launch a step of all steppers from one buffer to the other."""
         before, after = self._buffers[source].own, self._buffers[1 - source].own
+        wrenches = self.watched_wrenches
+        if wrenches:
+            wrenches.begin()
         for part in self._parts:
             if part.motion:
                 part.motion.follow(before, after)
@@ -482,6 +507,9 @@ class Integrator:
             self._worlds.settle(self._parts, before, after)
         if self._changes:
             self._changes(before, after)
+        if wrenches:
+            with timer("wrenches"):
+                wrenches.sum(after, self._coupled and self._coupled.decoupled)
 
     def _load_modules(self) -> None:
         for part in self._parts:
@@ -492,3 +520,7 @@ class Integrator:
             self._worlds.load_modules()
         if self._changes:
             device_arrays.load_kernels(self._changes.kernels, self.model.wp_device)
+        if self.watched_wrenches:
+            if self._coupled is not None:
+                self.watched_wrenches.follow(self._coupled)
+            device_arrays.load_kernels(self.watched_wrenches.kernels, self.model.wp_device)

@@ -202,6 +202,9 @@ class StepDriver:
             self.energy.check_drift(before, start)
         with timer("finish"):  # positions, velocities and accelerations of accepted substeps
             self.finish(before, after)
+        if self.integrator.watched_wrenches:
+            with timer("wrenches"):
+                self.integrator.watched_wrenches.add(self, start)
         return start
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
