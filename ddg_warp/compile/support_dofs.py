@@ -56,7 +56,9 @@ class SupportDofs:
         none = np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3, 3))
         support, place, share = (np.concatenate(values) for values in zip(none, *columns, strict=True))
         first, reference = np.array(first, int), np.array(reference, int)
-        return cls(support, place, place >= host.nodes, _nodes(host, place), share, first, _nodes(host, reference)[:, 0])
+        return cls(
+            support, place, place >= host.nodes, _nodes(host, place), share, first, _nodes(host, reference)[:, 0]
+        )
 
 
 def _nodes(host: DofStorage, places: np.ndarray) -> np.ndarray:

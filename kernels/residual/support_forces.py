@@ -318,7 +318,7 @@ def normal_moment_kernel(real):
     With edges e_i of a triangle, the components c_i e_i of a moment m have least squares: c = E^T (E E^T + t n n^T)^-1 m, with the
     unit normal n and any t > 0.
     """
-    X, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
+    X = wp.types.vector(3, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def turn(

@@ -467,7 +467,9 @@ class Integrator:
             SceneError: `watch_wrenches` was not called before the step.
         """
         if self.watched_wrenches is None:
-            raise SceneError("wrenches: they are evaluated within steps; call integrator.watch_wrenches() before the step")
+            raise SceneError(
+                "wrenches: they are evaluated within steps; call integrator.watch_wrenches() before the step"
+            )
         return self.watched_wrenches.values()
 
     def forget(self) -> None:

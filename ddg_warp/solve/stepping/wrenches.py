@@ -1,6 +1,5 @@
 """Wrenches of steps: force and moment at every support, grip and obstacle; see `kernels.residual.support_forces`."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -167,9 +166,7 @@ class _Runs:
             inputs, outputs = [self._starts, self.force, self.moment], [*self._of_runs]
             wp.launch(add_runs, (len(self._starts) - 1, self.worlds), inputs, outputs, device=self.device)
         inputs = [self._supports, self._by_support, *self._of_runs, excluded]
-        wp.launch(
-            add_supports, (len(self._supports), self.worlds), inputs, [force, moment], device=self.device
-        )
+        wp.launch(add_supports, (len(self._supports), self.worlds), inputs, [force, moment], device=self.device)
 
 
 class _Reactions:
@@ -364,7 +361,9 @@ class _Normals:
             corners[: len(of_element), i] = of_element
         _, of_element = np.unique(normals.element, axis=0, return_inverse=True)
         edges = np.zeros(len(normals), int)
-        np.bitwise_or.at(edges, of_element.reshape(-1), np.where(normals.corner < 0, 0, 1 << np.maximum(normals.corner, 0)))
+        np.bitwise_or.at(
+            edges, of_element.reshape(-1), np.where(normals.corner < 0, 0, 1 << np.maximum(normals.corner, 0))
+        )
         arrays = columns, corners, normals.corner, edges[of_element.reshape(-1)]
         self._inputs = [owner._integers(values) for values in arrays]
         self.kernels = [support_forces.normal_moment_kernel(model.types.real)]
