@@ -145,6 +145,13 @@ class Model:
             return None
         return ContactModel(self.coupled, self.types.real, self.coupled.rest().q)
 
+    @cached_property
+    def static_wrenches(self):
+        """Sums of reactions over supports at given states (`Wrenches`)."""
+        from ddg_warp.solve.stepping.wrenches import Wrenches
+
+        return Wrenches(self)
+
     @property
     def magnetic(self) -> bool:
         """True if rods are in a magnetic field."""

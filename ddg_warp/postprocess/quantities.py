@@ -7,7 +7,6 @@ import warp as wp
 
 from ddg_warp import argument_checks, device_arrays
 from ddg_warp.capture_lock import launches
-from ddg_warp.compile.dof_map import gathered
 from ddg_warp.kernels.terms import AXISYMMETRIC, MAGNETS, SHELLS
 from ddg_warp.model.model import check_model
 from ddg_warp.model.state import query
@@ -38,7 +37,7 @@ def energies(model, state) -> dict:
 
 @launches
 def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
-    """Return the reaction of every support of the scene.
+    """Return the reaction of every support of the scene at a state; `Integrator.wrenches` returns those of a step.
 
     Supports are ordered as added: of rods, then of shells, rings and obstacles.
 
@@ -56,27 +55,20 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
     point = None if point is None else np.array(argument_checks.vector("reactions: point", point))
     factor = argument_checks.number("reactions: factor", factor)
     tangent = Tangent(model)
-    q = tangent.dofs(state)
-    gradient = tangent.gradient(state) - tangent.friction(state)
-    force = tangent.back(np.where(tangent.free, 0.0, gradient - tangent.loads(factor, q)))
-    q = tangent.back(q)
-    scene = model.scene
-    first, shells = len(scene.supports), len(scene.shell_supports)
-    turns = np.zeros((model.worlds, first + shells + len(scene.ring_supports) + len(scene.obstacles), 3))
-    if shells:
-        turns[:, first : first + shells] = _normal_moments(tangent.parts[-1], state)
-    result = []
-    for i in range(turns.shape[1]):
-        worlds = []
-        for world in range(model.worlds):
-            parts = [part for part in tangent.parts if i < len(part.host.held)]
-            taken = [_taken(part, Tangent.of(part, q), Tangent.of(part, force), i, world) for part in parts]
-            points, push, twist = (np.concatenate(values) for values in zip(*taken, strict=True))
-            about = np.concatenate([points, np.zeros((1, 3))])[0] if point is None else point
-            moment = (np.cross(points - about, push) + twist).sum(0) + turns[world, i]
-            worlds.append((push.sum(0), moment, about))
-        result.append(Reaction(*(_each_world(np.array(values)) for values in zip(*worlds, strict=True))))
-    return result
+    forces = tangent.back(tangent.loads(factor, tangent.dofs(state)) + tangent.friction(state))
+    loads = [Tangent.of(part, forces) for part in tangent.parts]
+    if model.touch:
+        model.touch.evaluate(state.coupled.q, state.coupled.rate)
+        loads[-1] = loads[-1] + model.touch.terms.forces.numpy().astype(float).ravel()
+    result = model.static_wrenches.at(state, loads)
+    if point is None:
+        return result
+    return [
+        Reaction(
+            each.force, each.moment + np.cross(each.point - point, each.force), np.broadcast_to(point, each.point.shape)
+        )
+        for each in result
+    ]
 
 
 @dataclass(frozen=True)
@@ -143,58 +135,6 @@ def _check(call: str, model, state) -> None:
 def _each_world(values: np.ndarray) -> np.ndarray:
     """Return values (worlds, ...), without the axis if there is one world."""
     return values[0] if len(values) == 1 else values
-
-
-def _taken(part, q: np.ndarray, force: np.ndarray, support: int, world: int) -> tuple:
-    """Remove a support's reaction from `force`; return points, forces and moments (n, 3) in a world."""
-    host = part.host
-    constraint, x, f = host.held[support], *(values.reshape(part.model.worlds, -1)[world] for values in (q, force))
-    dofs, is_angle = host.dofs(constraint.places), constraint.places >= host.nodes
-    if constraint.normal is not None:
-        push = np.outer(f[dofs] @ constraint.normal, constraint.normal)
-        f[dofs] -= push
-        return x[dofs], push, 0.0 * push
-    fixed = dofs[np.arange(len(dofs)), constraint.components]
-    size, once = np.zeros(len(fixed)), np.unique(fixed, return_index=True)[1]
-    size[once] = gathered(f, fixed[once])
-    f[fixed[fixed >= 0]] = 0.0
-    ends = host.dofs(host.edge_ends(constraint.places[is_angle]))
-    dofs[is_angle] = ends[:, 0]
-    directions, edges = np.eye(3)[constraint.components], gathered(x, ends[:, 1]) - gathered(x, ends[:, 0])
-    directions[is_angle] = edges / np.linalg.norm(edges, axis=1, keepdims=True)
-    vectors = size[:, None] * directions
-    return gathered(x, dofs), vectors * ~is_angle[:, None], vectors * is_angle[:, None]
-
-
-def _normal_moments(part, state) -> np.ndarray:
-    """Return moments (worlds, supports, 3) that shell supports exert on prescribed normals.
-
-    The energy of an element is invariant under rotation of its nodes and normals. Hence the moment on the normals is minus the
-    moment of its nodal forces. Of several supports at one element, each carries the component along its edge.
-    """
-    worlds, count = part.coupled.worlds, len(part.model.scene.shell_supports)
-    result, x = np.zeros((worlds, count, 3)), part.back(part.dofs(state)).reshape(worlds, -1, 3)
-    for index, device in enumerate(part.coupled.sets):
-        host, measure = device.host, device.term.measure
-        element, row, support = host.normals[:, host.normals[2] < count]
-        if not element.size:
-            continue
-        least, most = np.full(len(host), count), np.full(len(host), -1)
-        np.minimum.at(least, element, support)
-        np.maximum.at(most, element, support)
-        alone = least == most
-        forces = part.forces(state, index)[: measure.nodes].reshape(measure.nodes, worlds, len(host), 3)
-        for world in range(worlds):
-            corners = x[world, host.slots[: measure.nodes]]
-            moments = -np.cross(corners, forces[:, world]).sum(0)
-            np.add.at(result[world], least[alone], moments[alone])
-            for e in np.flatnonzero(least < most):
-                selected = element == e
-                corner = (row[selected] - 3) // 3  # opposite to the edge
-                edges = corners[(corner + 2) % 3, e] - corners[(corner + 1) % 3, e]
-                components = edges * np.linalg.lstsq(edges.T, moments[e], rcond=None)[0][:, None]
-                np.add.at(result[world], support[selected], components)
-    return result
 
 
 @launches

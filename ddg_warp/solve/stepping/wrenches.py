@@ -1,6 +1,6 @@
 """Wrenches of steps: force and moment at every support, grip and obstacle; see `kernels.residual.support_forces`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -8,9 +8,11 @@ import warp as wp
 from ddg_warp import device_arrays
 from ddg_warp.compile.support_dofs import NormalMoments, SupportDofs
 from ddg_warp.kernels.collision.contact.obstacle_forces import obstacle_kernel, pairs_type
+from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.elements.coupled_element import coupled_storage
 from ddg_warp.kernels.elements.rod_layout import rod_storage
 from ddg_warp.kernels.residual import support_forces
+from ddg_warp.kernels.residual.coupled_residual import inputs_type
 from ddg_warp.kernels.residual.support_forces import ROWS
 from ddg_warp.kernels.stepping import wrench_sums
 from ddg_warp.solve.linear.sparse_system import lists
@@ -118,6 +120,18 @@ class Wrenches:
         for references, state in zip(self._references, [*after.groups, after.coupled], strict=False):
             references.shift(state, self.force, self.moment, self.point)
 
+    def at(self, state, loads: list[np.ndarray]) -> list[Reaction]:
+        """Return the reactions at a state without inertia and damping.
+
+        Args:
+            loads: external, contact and friction forces on the dofs of every rod group and of the coupled system, in space.
+        """
+        self.begin()
+        for part, own, load in zip(self._parts, [*state.groups, state.coupled], loads, strict=False):
+            part.add_static(own, load)
+        self.sum(state, None)
+        return self.values()
+
     def values(self) -> list[Reaction]:
         """Return the wrench of every support. Reads from the device."""
         arrays = [array.numpy().astype(float) for array in (self.force, self.moment, self.point)]
@@ -190,6 +204,13 @@ class _Reactions:
         entries.share = wp.array(dofs.share, dtype=wp.types.matrix((3, 3), self._real), device=self._device)
         entries.origin = wp.array(origins[dofs.support], dtype=self._vector, device=self._device)
 
+    def _at_rest(self) -> list:
+        """Return arrays of islands that have accepted a step without inertia."""
+        islands = Islands(self.part.columns, self._real, self._device)
+        islands.substep_accepted.fill_(1)
+        islands.substep_fraction.fill_(1.0)
+        return islands.arrays
+
     def _gather(self, target: np.ndarray, items: np.ndarray, elements: int) -> None:
         """Store the incidence list of entries: `items` that contribute to the entries `target`."""
         entries = self._entries
@@ -257,6 +278,20 @@ class RodReactions(_Reactions):
         inputs += [iterates.frame, iterates.target, iterates.target_angle, group.gravity, loading.force, loading.moment]
         outputs = [self._nodal.force, self._nodal.moment]
         self._launch(self._react, len(outputs[0]), [*inputs, int(loading.loaded), keeps], outputs)
+
+    def add_static(self, state, load: np.ndarray) -> None:
+        """Add the reactions at a state; see `Wrenches.at`."""
+        group, kind = self.part, replace(self.part.kind, drag=False)
+        load = load.reshape(group.columns, group.nodes, kind.block).swapaxes(0, 1)
+        vector = wp.types.vector(kind.dim, self._real)
+        force = device_arrays.upload(np.ascontiguousarray(load[..., : kind.dim]), vector, self._device)
+        moment = device_arrays.upload(np.ascontiguousarray(load[..., -1]), self._real, self._device)
+        weightless = wp.zeros(1, dtype=vector, device=self._device)
+        values = self.evaluate(group.element_inputs(state, state.last))
+        inputs = [self._entries, values, group.mass, group.rotary, *self._at_rest(), state.x, state.theta, state.frame]
+        inputs += [state.x, state.theta, weightless, force, moment, 1, 1]
+        kernel, outputs = support_forces.rod_reaction_kernel(kind, self._real), [self._nodal.force, self._nodal.moment]
+        self._launch(kernel, len(outputs[0]), inputs, outputs)
 
 
 def _elements_at(host, dofs: SupportDofs, k: np.ndarray, column: np.ndarray) -> tuple:
@@ -347,6 +382,21 @@ class CoupledReactions(_Reactions):
             self._normals.add(values, islands, q)
         if self._obstacles:
             self._obstacles.add(islands, q)
+
+    def add_static(self, state, load: np.ndarray) -> None:
+        """Add the reactions at a state; see `Wrenches.at`."""
+        coupled, islands = self.part, self._at_rest()
+        inputs = inputs_type(self._real, False)()
+        inputs.q = inputs.base = inputs.target = state.q
+        inputs.mass, inputs.blocks, inputs.nodes = coupled.mass, coupled.blocks, coupled.host.nodes
+        inputs.gravity = wp.zeros(1, dtype=self._vector, device=self._device)
+        inputs.load = wp.array(load.reshape(-1, 3), dtype=self._vector, device=self._device)
+        values, outputs = self.evaluate(state, state.q, coupled.still), [self._nodal.force, self._nodal.moment]
+        kernel = support_forces.coupled_reaction_kernel(self._real, self._real, False, False)
+        read = [self._entries, values, inputs, state.frame, coupled.edges, *islands]
+        self._launch(kernel, len(outputs[0]), read, outputs)
+        if self._normals:
+            self._normals.add(values, islands, state.q)
 
 
 class _Normals:
