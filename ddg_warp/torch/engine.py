@@ -72,6 +72,7 @@ class Engine:
         self._flagged, self._streams = {}, {}
         self._solves, self._excuse, self._fails = flag_kernels(model.types.real)
         self._graphs = self._by_start = None
+        self.wrenches = None  # made at the first request
         self._numbered = False  # True if tensors may have changed contact parameters
         self.integrator._worlds.watch()
         self.tables.invalid = view(self.integrator._worlds.invalid)

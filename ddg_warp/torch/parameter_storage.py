@@ -162,12 +162,16 @@ class ArrayParameterView:
 
     def put(self, entries: list) -> None:
         """Write the sum of the tensors of (storage, tensor) pairs and of the remaining contributions."""
+        self._assign(self.total(entries))
+        if self.weighs:
+            self._heavy.has_custom_mass = True
+
+    def total(self, entries: list) -> torch.Tensor:
+        """Return the sum of the tensors of (storage, tensor) pairs and of the remaining contributions."""
         total = self._rest([place for place, _ in entries])
         for _, value in entries:
             total = total + value
-        self._assign(total)
-        if self.weighs:
-            self._heavy.has_custom_mass = True
+        return total
 
     def restore(self) -> None:
         """Write the values of the model back."""

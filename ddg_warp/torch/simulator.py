@@ -24,6 +24,7 @@ from ddg_warp.torch.engine import LOAD, Engine
 from ddg_warp.torch.rollout import Plan, bytes_of, plan, roll
 from ddg_warp.torch.state_layout import copies, tensors
 from ddg_warp.torch.world_state import WorldState, outcome_names
+from ddg_warp.torch.wrenches import Wrenches, WrenchTensors
 
 SETTLED = {"failures", "check_every", "energy_bound"}  # arguments of `Integrator` that the engine sets
 
@@ -171,6 +172,27 @@ class Simulator(torch.nn.Module):
         return self._step(state, self._full(engine, parameters), self._controls(engine, controls))
 
     forward = step
+
+    @torch.compiler.disable
+    def wrenches(
+        self, before: WorldState, after: WorldState, parameters: dict | None = None, controls: dict | None = None
+    ) -> WrenchTensors:
+        """Return the wrenches of supports and grips in the step from `before` to `after`, with gradients by all arguments.
+
+        Gradients by `after` continue through the step. Parameters and controls must be those of the step. See
+        `Integrator.watch_wrenches` for the meaning of wrenches; worlds whose step was split into substeps have other ones.
+
+        Raises:
+            SceneError: the scheme is the midpoint rule, the model has contact, drag or follower loads on supports, a parameter is
+                not one of a term, or a name or shape does not fit.
+        """
+        engine = self._own(after)
+        if self._own(before) is not engine:
+            raise SceneError("wrenches: the states have different numbers of worlds")
+        if engine.wrenches is None:
+            engine.wrenches = Wrenches(engine)
+        parameters, controls = self._full(engine, parameters), self._controls(engine, controls)
+        return engine.wrenches(before, after, parameters, controls, self.dt)
 
     @torch.compiler.disable
     def rollout(

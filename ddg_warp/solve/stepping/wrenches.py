@@ -249,7 +249,7 @@ class RodReactions(_Reactions):
     def __init__(self, model, group, dofs: SupportDofs, origins: np.ndarray):
         super().__init__(model, group, dofs, origins)
         kind, real = group.kind, self._real
-        target, element, column, local = _elements_at(group.host, dofs, *self._index(dofs.place))
+        target, element, column, local = elements_at(group.host, dofs, *self._index(dofs.place))
         listed, where = np.unique(np.stack([column, element], -1), axis=0, return_inverse=True)
         self._gather(target, where.reshape(-1) * ROWS + local, len(listed))
         self._listed, locals_count = self._pairs(listed), kind.span + 1 + (2 if kind.twist else 0)
@@ -294,7 +294,7 @@ class RodReactions(_Reactions):
         self._launch(kernel, len(outputs[0]), inputs, outputs)
 
 
-def _elements_at(host, dofs: SupportDofs, k: np.ndarray, column: np.ndarray) -> tuple:
+def elements_at(host, dofs: SupportDofs, k: np.ndarray, column: np.ndarray) -> tuple:
     """Return (entry, element, column, local node) of all elements at nodes or angles k of columns of a rod group."""
     kind, count, entry = host.kind, host.count[column], np.arange(len(k))
     found = []

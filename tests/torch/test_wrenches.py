@@ -1,0 +1,126 @@
+"""Wrenches of steps as tensors: values of the integrator, and gradients against differences."""
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+import ddg_warp as ddg  # noqa: E402
+from ddg_warp.torch.simulator import Simulator  # noqa: E402
+from tests.test_wrenches import DT, SCENES, SECTION, line, pendulum, sheet  # noqa: E402
+
+RUBBER = ddg.Material(young=2e6, poisson=0.35, density=1000.0, viscosity=1e-3)
+TIGHT = {"rtol": 1e-12, "max_iterations": 200}
+SCENES = SCENES | {"midedge": lambda scene: sheet(scene, "midedge")}
+
+
+def gripped(scene):
+    scene.clamp_end(scene.add_rod(line((0, 0, 0), (0.5, 0, 0.1)), section=SECTION, material=RUBBER), motion=ddg.Grip())
+
+
+def simulated(name, device, worlds=2):
+    scene = ddg.Scene(gravity=(0.3, 0.2, -9.81), mass_damping=0.8)
+    (gripped if name == "gripped" else SCENES[name])(scene)
+    return Simulator(scene.build(device, "float64", worlds=worlds), DT, **TIGHT)
+
+
+def started(simulator, seed=0):
+    """Return a state with motion after some steps."""
+    state = simulator.initial_state()
+    for _ in range(3):
+        state = simulator.step(state)
+    return state.detach()
+
+
+@pytest.mark.parametrize("name", [*SCENES, "gripped"])
+def test_tensors_are_the_wrenches_of_the_integrator(device, name):
+    simulator = simulated(name, device)
+    before = started(simulator)
+    watched = before.engine.integrator.watch_wrenches()
+    after = simulator.step(before)
+    result = simulator.wrenches(before, after)
+    for one, other in ((result.force, watched.force), (result.moment, watched.moment), (result.point, watched.point)):
+        expected = other.numpy()
+        np.testing.assert_allclose(one.detach().cpu().numpy(), expected, atol=1e-9 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("name", [*SCENES, "gripped"])
+def test_gradients_against_differences(device, name):
+    """Gradients by the start state, a stiffness, gravity, forces and poses, through the step."""
+    simulator = simulated(name, device)
+    before = started(simulator)
+    random = np.random.default_rng(0)
+    model = before.engine.model
+    term = (
+        "shell_stretch.stiffness"
+        if "shell_stretch.stiffness" in before.engine.tables.names()
+        else "rod_stretch.stiffness"
+    )
+    stiffness = simulator.parameter(term)
+    inputs = {
+        "positions": torch.zeros_like(before.positions),
+        "velocities": torch.zeros_like(before.velocities),
+        "stiffness": torch.zeros((model.worlds, 1), dtype=torch.float64, device=stiffness.device),
+        "gravity": torch.zeros((model.worlds, 3), dtype=torch.float64, device=stiffness.device),
+        "forces": torch.zeros_like(before.positions),
+    }
+    if name == "gripped":
+        inputs["poses"] = torch.zeros((model.worlds, 1, 6), dtype=torch.float64, device=stiffness.device)
+    masses = [mass for mass in ("rod.mass", "shell.mass") if mass in before.engine.tables.names()]
+    inputs["mass"] = torch.zeros_like(inputs["stiffness"])
+    weights = {}
+
+    def loss(**moved):
+        values = list(before.values)
+        layout = before.layout
+        values = layout.put_points(values, "x", "q", before.positions + moved["positions"])
+        values = layout.put_points(values, "v", "v", before.velocities + moved["velocities"])
+        state = type(before)(tuple(values), before.time, before.engine, before.codes, before.differentiable)
+        parameters = {term: stiffness * (1.0 + moved["stiffness"])}
+        for mass in masses:
+            parameters[mass] = simulator.parameter(mass) * (1.0 + moved["mass"])
+        controls = {
+            "gravity": moved["gravity"] + torch.tensor(model.scene.gravity, dtype=torch.float64),
+            "forces": moved["forces"],
+        }
+        if "poses" in moved:
+            controls["poses"] = moved["poses"]
+        after = simulator.step(state, parameters, controls)
+        result = simulator.wrenches(state, after, parameters, controls)
+        total = 0.0
+        for key in ("force", "moment"):
+            values = getattr(result, key)
+            if key not in weights:
+                weights[key] = torch.as_tensor(random.normal(size=values.shape), device=values.device)
+            total = total + (weights[key] * values).sum()
+        return total
+
+    moved = {key: value.clone().requires_grad_() for key, value in inputs.items()}
+    loss(**moved).backward()
+    sizes = {
+        "positions": 1e-6,
+        "velocities": 1e-4,
+        "stiffness": 1e-4,
+        "mass": 1e-3,
+        "gravity": 1e-3,
+        "forces": 1e-4,
+        "poses": 1e-6,
+    }
+    for key, value in inputs.items():
+        direction = torch.as_tensor(random.normal(size=value.shape), device=value.device)
+        step = sizes[key]
+        with torch.no_grad():
+            ends = [loss(**(inputs | {key: value + sign * step * direction})) for sign in (1.0, -1.0, 2.0, -2.0)]
+        difference = float((8.0 * (ends[0] - ends[1]) - (ends[2] - ends[3])) / (12.0 * step))
+        found = float((moved[key].grad * direction).sum())
+        assert found == pytest.approx(difference, rel=1e-6), key
+
+
+def test_models_without_gradients_are_refused(device):
+    scene = ddg.Scene()
+    pendulum(scene)
+    model = scene.build(device)
+    simulator = Simulator(model, DT, scheme="implicit_midpoint")
+    state = simulator.initial_state()
+    with pytest.raises(ddg.SceneError, match="midpoint"):
+        simulator.wrenches(state, simulator.step(state))
