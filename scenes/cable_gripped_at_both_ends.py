@@ -105,6 +105,24 @@ def observe(model, state) -> dict[str, float]:
     }
 
 
+def balance(model) -> float:
+    """Return the largest rate of momentum that weight, damping and grips leave over, over the largest grip force.
+
+    Steps go until the ends approach and rotate.
+    """
+    integrator, state, dt = ddg.Integrator(model, rtol=1e-9), equilibrium(model), model.scene.analysis.dt
+    integrator.watch_wrenches()
+    left, forces = [], []
+    for _ in range(int(1.5 * HANG / dt)):
+        before, state = state, integrator.step(state, dt)
+        mass = model.groups[0].mass.numpy()[..., None]
+        first, last = ((mass * each.groups[0].v.numpy()).sum((0, 1)) for each in (before, state))
+        forces.append(sum(wrench.force for wrench in integrator.wrenches()))
+        weight = mass.sum() * np.array(model.scene.gravity)
+        left.append((last - first) / dt + model.scene.mass_damping * last - weight - forces[-1])
+    return float(np.abs(left).max() / np.abs(forces).max())
+
+
 def check(result) -> list[ddg.Check]:
     """Check end positions, turns = twist + writhe at all times, convergence, and the return to equilibrium."""
     series = {name: np.array(values) for name, values in result.series.items()}
@@ -123,6 +141,7 @@ def check(result) -> list[ddg.Check]:
         ddg.Check("end nodes from where their motion has them [m]", series["end_error"].max(), 0.0, 1e-12, MOTION),
         ddg.Check("twist + writhe - turns, largest", np.abs(link - 2.0 * passes).max(), 0.0, 1e-5, LINK),
         ddg.Check("how often the cable passed through itself", np.abs(passes).max(), 0.0, 0.0, LINK),
+        ddg.Check("rate of momentum over grip forces and weight", balance(model), 0.0, 1e-7, "balance of momentum"),
         *once_reached(result, BACK + 1.0, [last], back),
     ]
 

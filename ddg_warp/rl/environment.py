@@ -15,6 +15,7 @@ from ddg_warp.model.controls import Controls
 from ddg_warp.torch.rotations import turned
 from ddg_warp.torch.simulator import Simulator, WorldState
 from ddg_warp.torch.state_layout import along
+from ddg_warp.torch.wrenches import WrenchTensors, without_gradient
 
 GOOD = CONVERGED, _ = tuple(outcome.NAMES[code] for code in (outcome.CONVERGED, outcome.NO_GRADIENT))
 AXES = "xyz"
@@ -65,6 +66,8 @@ class EpisodeState:
         actions: of the last step (B, actions); zero at the start of an episode.
         steps: number of steps of the episode (B,).
         outcomes: of the last step (B,), names as of `Integrator.outcomes`.
+        wrenches: of supports, grips and obstacles in the last step of the simulator, in the order of `Model.reactions`; zero at the
+            start of an episode, and None unless requested.
     """
 
     world: WorldState
@@ -73,6 +76,7 @@ class EpisodeState:
     actions: torch.Tensor
     steps: torch.Tensor
     outcomes: np.ndarray
+    wrenches: WrenchTensors | None = None
 
     @property
     def failed(self) -> torch.Tensor:
@@ -106,6 +110,8 @@ class Environment:
         start: start of episodes: a `WorldState` of B worlds, or goals (B, n) -> WorldState; by default the state at rest.
         substeps: steps of the simulator in one of the environment.
         parameters: as of `Simulator.step`.
+        wrenches: True to give wrenches to observations and rewards, see `EpisodeState`. They are differentiable where
+            `Simulator.wrenches` is, otherwise constants.
 
     Attributes:
         names, bounds: name and largest absolute value of every entry of an action (actions,).
@@ -129,6 +135,7 @@ class Environment:
         start: WorldState | Callable | None = None,
         substeps: int = 1,
         parameters: dict | None = None,
+        wrenches: bool = False,
     ):
         if not isinstance(simulator, Simulator):
             raise SceneError(f"Environment: {simulator!r} is no simulator; give a Simulator")
@@ -157,6 +164,12 @@ class Environment:
         self.bounds = torch.tensor([bound for _, _, bound, _ in entries], dtype=self.dtype, device=self.device)
         self._places = torch.tensor([6 * grip + place for grip, place, *_ in entries], device=self.device)
         self._turns = any(place >= 3 for _, place, *_ in entries)
+        self._wrenches, self._constant = argument_checks.flag("wrenches", wrenches), False
+        if wrenches:
+            engine = simulator.engine(self.worlds)
+            self._constant = bool(without_gradient(engine))
+            if self._constant:
+                engine.integrator.watch_wrenches()
         self._start = simulator.initial_state(self.worlds) if start is None else start
         first = self.begin(self.generators(0))
         self.observations, self.observation_dtype = self.observe(first).shape[1], self.observe(first).dtype
@@ -212,6 +225,7 @@ class Environment:
             torch.zeros((self.worlds, len(self.names)), dtype=self.dtype, device=self.device),
             torch.zeros(self.worlds, dtype=torch.long, device=self.device),
             np.full(self.worlds, CONVERGED),
+            WrenchTensors.zeros(world.engine) if self._wrenches else None,
         )
         return fresh if now is None else self._chosen(mask, replace(fresh, goals=goals), now)
 
@@ -226,17 +240,25 @@ class Environment:
         rates = torch.zeros((self.worlds, 6 * len(self.model.grips)), dtype=self.dtype, device=self.device)
         rates = rates.index_copy(1, self._places, actions).reshape(self.worlds, -1, 6)
         world, poses, outcomes = now.world, now.poses, np.full(self.worlds, CONVERGED, dtype=object)
-        failed = torch.zeros(self.worlds, dtype=torch.bool, device=self.device)
+        failed, wrenches = torch.zeros(self.worlds, dtype=torch.bool, device=self.device), now.wrenches
         for _ in range(self.substeps):
             moved = self._moved(poses, rates)
             after = self.simulator.step(world, self.parameters, {"poses": moved})
+            if self._wrenches:
+                wrenches = self._wrenches_of(world, after, moved).where(~(failed | after.failed), wrenches)
             step_outcomes = after.outcomes()
             outcomes = np.where(np.isin(outcomes, GOOD) & (step_outcomes != CONVERGED), step_outcomes, outcomes)
             failed = failed | after.failed
             if failed.any():  # failed worlds keep their state and continue with the next step
                 after, moved = _selected(failed, world, after), torch.where(failed[:, None, None], poses, moved)
             world, poses = after, moved
-        return EpisodeState(world, poses, now.goals, actions, now.steps + 1, outcomes.astype(str))
+        return EpisodeState(world, poses, now.goals, actions, now.steps + 1, outcomes.astype(str), wrenches)
+
+    def _wrenches_of(self, before: WorldState, after: WorldState, poses: torch.Tensor) -> WrenchTensors:
+        """Return the wrenches of the step that was just made."""
+        if self._constant:
+            return WrenchTensors.watched(after.engine)
+        return self.simulator.wrenches(before, after, self.parameters, {"poses": poses})
 
     def observe(self, now: EpisodeState) -> torch.Tensor:
         """Return observations (B, n)."""
@@ -343,6 +365,7 @@ class Environment:
             torch.where(mask[:, None], new.actions, old.actions),
             torch.where(mask, new.steps, old.steps),
             np.where(mask.cpu().numpy(), new.outcomes, old.outcomes),
+            new.wrenches and new.wrenches.where(mask, old.wrenches),
         )
 
 

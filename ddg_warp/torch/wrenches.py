@@ -33,6 +33,25 @@ class WrenchTensors:
     moment: torch.Tensor
     point: torch.Tensor
 
+    @classmethod
+    def zeros(cls, engine) -> "WrenchTensors":
+        """Return zero wrenches of all worlds of an engine."""
+        like = view(engine.before.arrays()[engine.fields[0].name])
+        return cls(*(like.new_zeros((engine.model.worlds, support_count(engine.model.scene), 3)) for _ in range(3)))
+
+    @classmethod
+    def watched(cls, engine) -> "WrenchTensors":
+        """Return the wrenches of the last step of an engine that watches them, without gradient."""
+        watched = engine.integrator.watched_wrenches
+        return cls(*(view(values).clone() for values in (watched.force, watched.moment, watched.point)))
+
+    def where(self, mask: torch.Tensor, other: "WrenchTensors") -> "WrenchTensors":
+        """Select these wrenches in worlds of a mask (B,), others elsewhere."""
+        mask = mask[:, None, None]
+        return WrenchTensors(
+            *(torch.where(mask, a, b) for a, b in zip(vars(self).values(), vars(other).values(), strict=True))
+        )
+
 
 class ElementForces(torch.autograd.Function):
     """Function `forces(term, q, s, w, p)` -> derivatives of element energies by local dofs (n, dofs)."""
@@ -69,6 +88,28 @@ def _launch(term, index: int, inputs, outputs) -> None:
         wp.launch(kernel, count, [*map(array, inputs)], [*map(array, outputs)], device=device)
 
 
+def without_gradient(engine) -> str:
+    """Return the feature of an engine's steps whose wrenches have no gradient; empty for none."""
+    model, parts = engine.model, _parts(engine.model)
+    fixed = [SupportDofs.of(part.host).place for part in parts]
+    refused = {
+        "the midpoint rule": engine.midpoint,
+        "contact": model.coupled is not None and model.coupled.host.contact_parameters is not None,
+        "drag": any(group.kind.drag for group in model.groups) or (model.coupled and model.coupled.host.drag),
+        "gyroscopic couples": engine.integrator.gyroscopic,
+        "follower loads on supports": any(
+            np.isin(load.places, places).any()
+            for part, places in zip(parts, fixed, strict=True)
+            for load in part.host.followers
+        ),
+    }
+    return next((name for name, used in refused.items() if used), "")
+
+
+def _parts(model) -> list:
+    return [*model.groups, *([model.coupled] if model.coupled is not None else [])]
+
+
 class Wrenches:
     """Wrenches of the steps of an engine.
 
@@ -77,30 +118,16 @@ class Wrenches:
     """
 
     def __init__(self, engine):
-        model, scene = engine.model, engine.model.scene
-        self.engine, self.model = engine, model
-        refused = {
-            "the midpoint rule": engine.midpoint,
-            "contact": model.touch is not None,
-            "drag": any(group.kind.drag for group in model.groups) or (model.coupled and model.coupled.host.drag),
-            "gyroscopic couples": engine.integrator.gyroscopic,
-        }
-        parts = [*model.groups, *([model.coupled] if model.coupled is not None else [])]
-        fixed = [SupportDofs.of(part.host) for part in parts]
-        refused["follower loads on supports"] = any(
-            np.isin(load.places, dofs.place).any()
-            for part, dofs in zip(parts, fixed, strict=True)
-            for load in part.host.followers
-        )
-        for name in (name for name, used in refused.items() if used):
+        self.engine, self.model = engine, engine.model
+        if name := without_gradient(engine):
             raise SceneError(
                 f"wrenches: no gradient goes through wrenches with {name}; take Integrator.wrenches or Environment(wrenches=True), "
                 "whose values have none"
             )
-        self._count = support_count(scene)
+        self._count, parts = support_count(self.model.scene), _parts(self.model)
         self._parts = [
-            (_Coupled if part is model.coupled else _Rods)(engine, i, part, dofs)
-            for i, (part, dofs) in enumerate(zip(parts, fixed, strict=True))
+            (_Coupled if part is self.model.coupled else _Rods)(engine, i, part, SupportDofs.of(part.host))
+            for i, part in enumerate(parts)
         ]
 
     def __call__(self, before, after, parameters: list, controls: dict, dt: float) -> WrenchTensors:

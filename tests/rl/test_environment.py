@@ -218,3 +218,43 @@ def test_seeds_are_as_large_as_those_of_numpy():
     seed = np.random.SeedSequence().entropy | 1 << 127
     first, second = (sim.generators(seed)[2].random() for _ in range(2))
     assert first == second != sim.generators(seed - 1)[2].random()
+
+
+def test_wrenches_are_observed_and_differentiable():
+    """Episodes hold the wrenches of steps, zero at their start; rewards of them have gradients by actions."""
+    env = environment(wrenches=True, substeps=2, observe=lambda now: now.wrenches.force.flatten(1))
+    now = env.begin(env.generators(0))
+    assert now.wrenches.force.shape == (WORLDS, 1, 3)
+    assert not now.wrenches.force.any()
+    actions = some_actions(1)[0]
+
+    def loss(actions):
+        after = env.step(now, actions)
+        return (after.wrenches.force[:, 0, 2] + after.wrenches.moment[:, 0, 1]).sum(), after
+
+    moved = actions.clone().requires_grad_()
+    value, after = loss(moved)
+    value.backward()
+    with torch.no_grad():
+        step = 1e-5
+        difference = (loss(actions + step * actions)[0] - loss(actions - step * actions)[0]) / (2.0 * step)
+    assert float((moved.grad * actions).sum()) == pytest.approx(float(difference), rel=1e-5)
+    fresh = env.begin(env.generators(1), after, torch.tensor([True, False, False]))
+    assert not fresh.wrenches.force[0].any()
+    torch.testing.assert_close(fresh.wrenches.force[1:], after.wrenches.force[1:], rtol=0.0, atol=0.0)
+
+
+def test_wrenches_in_contact_are_constants():
+    """In contact, observed wrenches are those of the integrator, without gradient."""
+    scene = a_scene()
+    rod = scene.add_rod(POINTS + [0.0, 0.0, 0.0045], section=ddg.Circle(0.004), material=SOFT)
+    scene.clamp(rod, motion=ddg.Grip(pivot=(0.1, 0.0, 0.0)))
+    scene.contact()
+    scene.add_obstacle(ddg.Plane())
+    env = environment(Simulator(built(scene), DT), wrenches=True)
+    now = env.step(env.begin(env.generators(0)), (1e-3 * some_actions(1)[0]).requires_grad_())
+    assert not now.failed.any()
+    watched = now.world.engine.integrator.watched_wrenches
+    assert now.wrenches.force.shape == (WORLDS, 2, 3)
+    assert not now.wrenches.force.requires_grad
+    np.testing.assert_array_equal(now.wrenches.force.cpu().numpy(), watched.force.numpy())
