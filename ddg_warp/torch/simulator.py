@@ -183,16 +183,19 @@ class Simulator(torch.nn.Module):
         `Integrator.watch_wrenches` for the meaning of wrenches; worlds whose step was split into substeps have other ones.
 
         Raises:
-            SceneError: the scheme is the midpoint rule, the model has contact, drag or follower loads on supports, a parameter is
-                not one of a term, or a name or shape does not fit.
+            SceneError: the scheme is the midpoint rule, the model has friction or follower loads on supports, a parameter is of drag
+                or contact, or a name or shape does not fit.
         """
         engine = self._own(after)
         if self._own(before) is not engine:
             raise SceneError("wrenches: the states have different numbers of worlds")
         if engine.wrenches is None:
             engine.wrenches = Wrenches(engine)
-        parameters, controls = self._full(engine, parameters), self._controls(engine, controls)
-        return engine.wrenches(before, after, parameters, controls, self.dt)
+        full, controls = self._full(engine, parameters), self._controls(engine, controls)
+        with engine.turn():
+            with torch.no_grad():
+                engine.tables.write(tuple(name for name, _ in full), [value for _, group in full for value in group])
+            return engine.wrenches(before, after, full, controls, self.dt)
 
     @torch.compiler.disable
     def rollout(

@@ -5,6 +5,7 @@ A wrench is an explicit function of the states at both ends of a step of implici
 continue through the step.
 """
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,8 @@ import warp as wp
 from ddg_warp.compile.support_dofs import NormalMoments, SupportDofs
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.adjoint.element_forces import force_kernels
+from ddg_warp.kernels.forces import drag
+from ddg_warp.scene.drag import flow_at
 from ddg_warp.solve.forces.control_loads import loaded_rows
 from ddg_warp.solve.stepping.wrenches import elements_at, support_count
 from ddg_warp.torch.parameter_storage import TermParameterView
@@ -84,18 +87,64 @@ def _launch(term, index: int, inputs, outputs) -> None:
 
     count = len(inputs[0])
     if count:
-        device = wp.device_from_torch(inputs[0].device)
-        wp.launch(kernel, count, [*map(array, inputs)], [*map(array, outputs)], device=device)
+        with _torch_stream(inputs[0]):
+            device = wp.device_from_torch(inputs[0].device)
+            wp.launch(kernel, count, [*map(array, inputs)], [*map(array, outputs)], device=device)
+
+
+def _torch_stream(like: torch.Tensor):
+    """Return a context in which Warp launches on torch's stream."""
+    if not like.is_cuda:
+        return nullcontext()
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(like.device)))
+
+
+class ContactForces(torch.autograd.Function):
+    """Function `forces(model, rate, q)` -> contact forces on dof blocks (worlds blocks, 3) at positions q.
+
+    `rate`: rate of the inertial stiffness (worlds,), empty for none; see `ContactModel.evaluate`.
+    """
+
+    @staticmethod
+    def forward(ctx, model, rate, q):
+        ctx.model, ctx.rate = model, rate
+        ctx.save_for_backward(q)
+        with _torch_stream(q):
+            _evaluate_contact(model, rate, q)
+            return view(model.touch.terms.forces).clone()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, cotangent):
+        (q,), model = ctx.saved_tensors, ctx.model
+        with _torch_stream(q):
+            x = _evaluate_contact(model, ctx.rate, q)
+            v, result = _blocks(cotangent), wp.zeros_like(x)
+            model.touch.terms.product(v, result, x)
+            return None, None, -view(result)
+
+
+def _blocks(values: torch.Tensor) -> wp.array:
+    """Return vectors of dof blocks (n, 3) as a Warp array."""
+    real = wp.dtype_from_torch(values.dtype)
+    return wp.from_torch(values.detach().contiguous(), dtype=wp.types.vector(3, real), requires_grad=False)
+
+
+def _evaluate_contact(model, rate: torch.Tensor, q: torch.Tensor) -> wp.array:
+    """Evaluate contact at positions q, which are returned."""
+    x = _blocks(q)
+    model.touch.evaluate(x, wp.from_torch(rate.contiguous()) if len(rate) else None)
+    return x
 
 
 def without_gradient(engine) -> str:
     """Return the feature of an engine's steps whose wrenches have no gradient; empty for none."""
     model, parts = engine.model, _parts(engine.model)
+    contact = model.coupled and model.coupled.host.contact_parameters
     fixed = [SupportDofs.of(part.host).place for part in parts]
     refused = {
         "the midpoint rule": engine.midpoint,
-        "contact": model.coupled is not None and model.coupled.host.contact_parameters is not None,
-        "drag": any(group.kind.drag for group in model.groups) or (model.coupled and model.coupled.host.drag),
+        "friction": contact is not None and contact.has_friction,
         "gyroscopic couples": engine.integrator.gyroscopic,
         "follower loads on supports": any(
             np.isin(load.places, places).any()
@@ -137,7 +186,7 @@ class Wrenches:
             for place, values in zip(self.engine.tables.of(name)[1], tensors, strict=True):
                 if isinstance(place, TermParameterView):
                     given[place.index, place.is_rod_group, place.name] = values
-                elif place.weighs or name == "rod.inertia":
+                elif getattr(place, "weighs", False):
                     summed.setdefault((place.index, place.is_rod_group, place.key[1]), []).append((place, values))
                 else:
                     raise SceneError(f"wrenches: no gradient goes through wrenches by {name}; leave it out")
@@ -232,6 +281,12 @@ class _Part:
         contributions = elements[local[None], column[None] + self._worlds * self._columns]
         reaction = elements.new_zeros((worlds, count, 3)).index_add(1, targets, contributions)
         reaction = reaction - self._loads(time, controls)
+        if self.resisted:
+            for some, resistance in self._drag(states, dt, time):
+                reaction = reaction.index_add(1, some, resistance)
+        contact = self._contact(after)
+        if contact is not None:
+            reaction = reaction - contact[self._index(self.dofs.place)]
         damping = self.model.scene.mass_damping
         rate = 1.0 / dt
         for some, x, v, is_node in ((self._nodes, "x", "v", True), (self._angles, "theta", "omega", False)):
@@ -258,6 +313,42 @@ class _Part:
         """Yield the moments on prescribed shell normals."""
         yield from ()
 
+    def _contact(self, after: dict) -> torch.Tensor | None:
+        """Return contact forces on all places; None without contact."""
+        return None
+
+    @property
+    def resisted(self) -> bool:
+        """True with drag."""
+        raise NotImplementedError
+
+    def _edges(self) -> tuple:
+        """Return edges with drag: indices of both nodes and of angles (-1 without), and coefficients (rows, n)."""
+        raise NotImplementedError
+
+    def _drag(self, states, dt: float, time: float):
+        """Yield entries, and the resistance of drag there (worlds, n, 3); see `kernels.forces.drag`."""
+        before, after = states
+        first, last, angles, p = self._edges()
+        x, v = self._flat(before, "x"), self._flat(before, "v")
+        flow = self._numbers(flow_at(self.model.scene, time))
+        edge = x[last] - x[first]
+        half = _half_resistance(edge, 0.5 * (v[first] + v[last]) - flow, p)
+        one = torch.eye(3, dtype=x.dtype, device=x.device)
+        D = x.new_zeros((len(x), 3, 3))
+        D = D.index_add(0, first, half + one * p[drag.FIRST][:, None, None])
+        D = D.index_add(0, last, half + one * p[drag.LAST][:, None, None])
+        nodes = self._index(self.dofs.place[self._nodes])
+        moved = self._flat(after, "x")[nodes] - x[nodes] - flow * dt
+        yield self._long(self._nodes), torch.einsum("wnij,wnj->wni", D[nodes], moved) / dt
+        if len(self._angles):
+            theta, twisted = self._flat(before, "theta"), torch.nonzero(angles >= 0).flatten()
+            spin = p[drag.ROTATIONAL] * edge.norm(dim=-1) / dt
+            spin = x.new_zeros(len(theta)).index_add(0, angles[twisted], spin[twisted])
+            places = self._index(self.dofs.place[self._angles])
+            turned = self._flat(after, "theta")[places] - theta[places]
+            yield self._long(self._angles), spin[places][..., None] * turned
+
     def _parameters(self, term, key: tuple, given, stored, pick) -> list[torch.Tensor]:
         """Return rest measure and parameters (n,) of elements; `pick` selects those of an array in the layout of `given`."""
         index, is_rod_group, prefix = key
@@ -267,6 +358,28 @@ class _Part:
             values = given.get((index, is_rod_group, name))
             result.append(pick(self._numbers(stored(name)) if values is None else values))
         return result
+
+
+def _half_resistance(e: torch.Tensor, v: torch.Tensor, p: torch.Tensor) -> torch.Tensor:
+    """Return the resistance of half an edge (n, 3, 3) [N s/m]; see `kernels.forces.drag.edge_function`."""
+    length = e.norm(dim=-1)
+    t = e / length[:, None]
+    tangential, normal, least, slope = (p[row] for row in (drag.TANGENTIAL, drag.NORMAL, drag.SPEED, drag.SLOPE))
+    granular = least > 0.0
+    if granular.any():
+        least = torch.where(granular, least, 1.0)
+        along = (v * t).sum(-1)
+        speed = torch.sqrt((v * v).sum(-1) + least**2)
+        sine = (v - t * along[:, None]).norm(dim=-1) / speed
+        root = torch.sqrt(slope**2 + sine**2)
+        leading = (1.0 - sine / root) / torch.sqrt(along**2 + least**2)
+        across = normal + p[drag.LATERAL] / (root * speed)
+        forward = tangential + torch.relu(p[drag.FRICTION] / speed + p[drag.LEADING] * leading)
+        normal, tangential = torch.where(granular, across, normal), torch.where(granular, forward, tangential)
+    one = torch.eye(3, dtype=e.dtype, device=e.device)
+    outer = t[:, :, None] * t[:, None]
+    total = one * normal[:, None, None] + outer * (tangential - normal)[:, None, None]
+    return total * (0.5 * length)[:, None, None]
 
 
 def _local_forces(measure, f: torch.Tensor, dim: int) -> torch.Tensor:
@@ -333,6 +446,25 @@ class _Rods(_Part):
 
     def _lagged_tangents(self, before: dict) -> torch.Tensor:
         return before[f"{self.number}/frame"][3:6].reshape(3, -1).T
+
+    @property
+    def resisted(self) -> bool:
+        """True with drag."""
+        return self.part.kind.drag
+
+    def _edges(self) -> tuple:
+        """Return edges with drag, see `_Part`."""
+        group = self.part
+        k, column = (
+            values.ravel() for values in np.meshgrid(*map(np.arange, (group.nodes, group.rods)), indexing="ij")
+        )
+        count, closed = group.host.count[column], group.kind.closed
+        some = k < count - (0 if closed else 1)
+        k, column = k[some], column[some]
+        following = np.where(k + 1 == count[some], 0, k + 1)
+        first, last = (self._index(node * group.rods + column).reshape(-1) for node in (k, following))
+        p = view(group.drag).reshape(drag.ROWS, -1)[:, first]
+        return first, last, first if group.kind.twist else first * 0 - 1, p
 
     def _element_forces(self, states, given, dt: float) -> torch.Tensor:
         (before, after), group, kind = states, self.part, self.part.kind
@@ -445,6 +577,25 @@ class _Coupled(_Part):
         tangents = before["net/frame"][3:6].T.reshape(worlds, coupled.edges, 3)
         start, rest = coupled.angle_start, coupled.blocks - coupled.angle_start - coupled.edges
         return torch.nn.functional.pad(tangents, (0, 0, start, rest)).reshape(-1, 3)
+
+    @property
+    def resisted(self) -> bool:
+        """True with drag."""
+        return self.part.drag is not None
+
+    def _edges(self) -> tuple:
+        """Return edges with drag, see `_Part`."""
+        ends, angles, _ = self.part.host.drag
+        first, last, of_angles = (self._index(values).reshape(-1) for values in (*ends, angles))
+        free = self._long(angles < 0).repeat(len(self._worlds)) > 0
+        return first, last, torch.where(free, -1, of_angles), view(self.part.drag)
+
+    def _contact(self, after: dict) -> torch.Tensor | None:
+        """Return contact forces on all dof blocks; None without contact."""
+        if self.part.host.contact_parameters is None:
+            return None
+        q = after["net/q"]
+        return ContactForces.apply(self.model, after.get("net/rate", q.new_zeros(0)), q)
 
     def _element_forces(self, states, given, dt: float) -> torch.Tensor:
         (before, after), coupled, worlds = states, self.part, len(self._worlds)

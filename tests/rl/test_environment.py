@@ -244,12 +244,12 @@ def test_wrenches_are_observed_and_differentiable():
     torch.testing.assert_close(fresh.wrenches.force[1:], after.wrenches.force[1:], rtol=0.0, atol=0.0)
 
 
-def test_wrenches_in_contact_are_constants():
-    """In contact, observed wrenches are those of the integrator, without gradient."""
+def test_wrenches_with_friction_are_constants():
+    """With friction, observed wrenches are those of the integrator, without gradient."""
     scene = a_scene()
     rod = scene.add_rod(POINTS + [0.0, 0.0, 0.0045], section=ddg.Circle(0.004), material=SOFT)
     scene.clamp(rod, motion=ddg.Grip(pivot=(0.1, 0.0, 0.0)))
-    scene.contact()
+    scene.contact(friction=0.3)
     scene.add_obstacle(ddg.Plane())
     env = environment(Simulator(built(scene), DT), wrenches=True)
     now = env.step(env.begin(env.generators(0)), (1e-3 * some_actions(1)[0]).requires_grad_())

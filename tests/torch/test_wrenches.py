@@ -14,6 +14,34 @@ TIGHT = {"rtol": 1e-12, "max_iterations": 200}
 SCENES = SCENES | {"midedge": lambda scene: sheet(scene, "midedge")}
 
 
+def dragged(scene):
+    scene.flow = (0.3, 0.1, 0.2)
+    scene.drag(pendulum(scene), tangential=0.3, normal=0.8, rotational=1e-3)
+
+
+def in_sand(scene):
+    scene.flow = (0.3, 0.1, 0.2)
+    scene.drag(pendulum(scene), ddg.Granular(lateral=3.0, friction=0.5, leading=0.5, speed=0.1))
+
+
+def joined_and_dragged(scene):
+    scene.flow = (0.3, 0.1, 0.2)
+    SCENES["joined"](scene)
+    scene.drag([0], tangential=0.3, normal=0.8, rotational=1e-3)
+
+
+def pressed(scene):
+    """Add two clamped rods, one lying on the other and both on a plane, without friction."""
+    for i, height in enumerate((0.0105, 0.0315)):
+        points = line((0, 0.1 * i, height), (0.5, 0.05 - 0.05 * i, height))
+        scene.clamp_end(scene.add_rod(points, section=SECTION, material=RUBBER))
+    scene.contact()
+    scene.add_obstacle(ddg.Plane())
+
+
+SCENES |= {"dragged": dragged, "in_sand": in_sand, "joined_and_dragged": joined_and_dragged, "pressed": pressed}
+
+
 def gripped(scene):
     scene.clamp_end(scene.add_rod(line((0, 0, 0), (0.5, 0, 0.1)), section=SECTION, material=RUBBER), motion=ddg.Grip())
 
@@ -39,6 +67,8 @@ def test_tensors_are_the_wrenches_of_the_integrator(device, name):
     watched = before.engine.integrator.watch_wrenches()
     after = simulator.step(before)
     result = simulator.wrenches(before, after)
+    if name == "pressed":
+        assert result.force[0, -1, 2] > 1.0
     for one, other in ((result.force, watched.force), (result.moment, watched.moment), (result.point, watched.point)):
         expected = other.numpy()
         np.testing.assert_allclose(one.detach().cpu().numpy(), expected, atol=1e-9 * np.abs(expected).max())
