@@ -61,6 +61,29 @@ def sheet(scene, bending):
     scene.hold(shell, [len(points) - 1], "z")
 
 
+def oblique(scene):
+    """Add a sheet on an oblique symmetry plane and one along an axis, whose edges share a corner."""
+    points, triangles = meshes.rectangle(5, 4, (0.4, 0.3))
+    low, side = (np.flatnonzero(points[:, axis] < 1e-9) for axis in (0, 1))
+    c, s = np.cos(0.6), np.sin(0.6)
+    points = points @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+    shell = scene.add_shell(points, triangles, thickness=4e-3, material=RUBBER)
+    scene.symmetry(shell, low, (c, 0.0, s))
+    scene.symmetry(shell, side, "y")
+    scene.hold(shell, [len(points) - 1], "xz")
+
+
+def stiffened(scene):
+    """Add a clamped sheet with a rod on it."""
+    points, triangles = meshes.rectangle(5, 4, (0.4, 0.3))
+    shell = scene.add_shell(points, triangles, thickness=4e-3, material=RUBBER)
+    scene.clamp_boundary(shell, np.flatnonzero(points[:, 0] < 1e-9), motion=shake())
+    row = np.flatnonzero(np.abs(points[:, 1] - points[:, 1].max()) < 1e-9)
+    row = row[np.argsort(points[row, 0])]
+    rod = scene.add_rod(points[row], section=SECTION, material=RUBBER)
+    scene.attach(rod, range(len(row)), shell, row)
+
+
 def balance(integrator, before, after, dt) -> tuple:
     """Return the excess of force and of moment about the origin that no wrench explains, over the largest term."""
     model, tangent = integrator.model, Tangent(integrator.model)
@@ -154,6 +177,8 @@ SCENES = {
     "joined": joined,
     "midedge_dof": lambda scene: sheet(scene, "midedge_dof"),
     "hinge": lambda scene: sheet(scene, "hinge"),
+    "oblique": oblique,
+    "stiffened": stiffened,
 }
 
 

@@ -18,7 +18,7 @@ from ddg_warp.kernels.adjoint.element_forces import force_kernels
 from ddg_warp.kernels.forces import drag
 from ddg_warp.scene.drag import flow_at
 from ddg_warp.solve.forces.control_loads import loaded_rows
-from ddg_warp.solve.stepping.wrenches import elements_at, support_count
+from ddg_warp.solve.stepping.wrenches import coupled_elements_at, elements_at, support_count
 from ddg_warp.torch.parameter_storage import TermParameterView
 from ddg_warp.torch.state_layout import view
 
@@ -534,28 +534,17 @@ class _Coupled(_Part):
         super().__init__(engine, number, coupled, dofs)
         host, scene = coupled.host, engine.model.scene
         normals = NormalMoments.of(host, len(scene.supports), len(scene.shell_supports))
-        self._sets, items, first = [], [], 0
-        at = {}
-        for entry, place in enumerate(dofs.place.tolist()):
-            at.setdefault(place, []).append(entry)
-        columns = np.zeros(len(normals), int)
+        self._listed, *items, columns = coupled_elements_at(host, dofs, normals)
+        self._items, self._columns = tuple(map(self._long, items)), sum(map(len, self._listed))
+        self._normals = []  # supports, columns, nodes of elements, corner and edges of entries of one set
         for index, element_set in enumerate(host.sets):
-            of_normals = normals.element[:, 0] == index
-            wanted = np.isin(element_set.slots, dofs.place).any(0)
-            wanted[normals.element[of_normals, 1]] = True
-            listed = np.flatnonzero(wanted)
-            for column, element in enumerate(listed):
-                for local, block in enumerate(element_set.slots[:, element].tolist()):
-                    items += [(entry, first + column, local) for entry in at.get(block, ())]
-            columns[of_normals] = first + np.searchsorted(listed, normals.element[of_normals, 1])
-            if len(listed):
-                self._sets.append((index, listed))
-            first += len(listed)
-        self._columns = first
-        self._items = tuple(map(self._long, np.array(items, int).reshape(-1, 3).T))
-        self._normals, self._normal_columns = normals, self._long(columns)
-        sets = host.sets
-        self._corners = [sets[i].slots[: sets[i].term.measure.nodes, e] for i, e in normals.element]
+            some = np.flatnonzero(normals.element[:, 0] == index)
+            for chosen in (some[normals.corner[some] < 0], some[normals.corner[some] >= 0]):
+                if len(chosen):
+                    element, corner = normals.element[chosen, 1], normals.corner[chosen]
+                    nodes = element_set.slots[: element_set.term.measure.nodes, element]
+                    edges = (element[:, None] == element) @ np.eye(3)[corner] if corner[0] >= 0 else None
+                    self._normals.append((normals.support[chosen], self._long(columns[chosen]), nodes, corner, edges))
 
     def _index(self, places) -> torch.Tensor:
         return self._long(places)[None] + self._worlds * self.part.blocks
@@ -606,7 +595,9 @@ class _Coupled(_Part):
             q = torch.cat([blocks[:, : -host.spins], spins], 1).reshape(-1, 3)
         rows = max(len(element_set.slots) for element_set in host.sets)
         parts = []
-        for index, listed in self._sets:
+        for index, listed in enumerate(self._listed):
+            if not len(listed):
+                continue
             part = coupled.sets[index]
             term, measure, count = part.term, part.term.measure, part.elements
             slots = host.sets[index].slots[:, listed]
@@ -643,18 +634,16 @@ class _Coupled(_Part):
 
     def _normal_moments(self, after: dict, elements: torch.Tensor):
         """Yield the moments on prescribed shell normals; see `NormalMoments`."""
-        normals, x = self._normals, self._flat(after, "x")
-        for support in np.unique(normals.support):
-            for entry in np.flatnonzero(normals.support == support):
-                nodes = [x[self._index(np.array([node]))[:, 0]] for node in self._corners[entry]]
-                column = self._normal_columns[entry] + self._worlds[:, 0] * self._columns
-                moment = -sum(torch.linalg.cross(node - nodes[0], elements[n, column]) for n, node in enumerate(nodes))
-                if normals.corner[entry] >= 0:
-                    alike = (normals.element == normals.element[entry]).all(1)
-                    edges = [nodes[(c + 1) % 3] - nodes[c] for c in normals.corner[alike]]
-                    normal = torch.linalg.cross(nodes[1] - nodes[0], nodes[2] - nodes[0])
-                    gram = normal[:, :, None] * normal[:, None] / normal.norm(dim=-1)[:, None, None]
-                    gram = gram + sum(edge[:, :, None] * edge[:, None] for edge in edges)
-                    own = nodes[(normals.corner[entry] + 1) % 3] - nodes[normals.corner[entry]]
-                    moment = own * (own * torch.linalg.solve(gram, moment)).sum(-1, keepdim=True)
-                yield self._long([support]), 0.0 * moment[:, None], nodes[0][:, None], moment[:, None]
+        x = self._flat(after, "x")
+        for support, columns, nodes, corner, edges in self._normals:
+            corners = torch.stack([x[self._index(node)] for node in nodes])
+            forces = elements[: len(nodes), columns[None] + self._worlds * self._columns]
+            moment = -torch.linalg.cross(corners - corners[:1], forces).sum(0)
+            if edges is not None:
+                sides = corners[[1, 2, 0]] - corners[:3]
+                normal = torch.linalg.cross(sides[0], -sides[2])
+                gram = normal[..., :, None] * normal[..., None, :] / normal.norm(dim=-1)[..., None, None]
+                gram = gram + torch.einsum("ne,ewni,ewnj->wnij", self._numbers(edges), sides, sides)
+                own = sides[self._long(corner), :, torch.arange(len(corner), device=x.device)].transpose(0, 1)
+                moment = own * (own * torch.linalg.solve(gram, moment)).sum(-1, keepdim=True)
+            yield self._long(support), 0.0 * moment, corners[0], moment

@@ -97,6 +97,8 @@ def test_gradients_against_differences(device, name):
     if name == "gripped":
         inputs["poses"] = torch.zeros((model.worlds, 1, 6), dtype=torch.float64, device=stiffness.device)
     masses = [mass for mass in ("rod.mass", "shell.mass") if mass in before.engine.tables.names()]
+    if name == "oblique":  # velocities off a skew support would leave its plane
+        del inputs["velocities"]
     inputs["mass"] = torch.zeros_like(inputs["stiffness"])
     weights = {}
 
@@ -104,7 +106,7 @@ def test_gradients_against_differences(device, name):
         values = list(before.values)
         layout = before.layout
         values = layout.put_points(values, "x", "q", before.positions + moved["positions"])
-        values = layout.put_points(values, "v", "v", before.velocities + moved["velocities"])
+        values = layout.put_points(values, "v", "v", before.velocities + moved.get("velocities", 0.0))
         state = type(before)(tuple(values), before.time, before.engine, before.codes, before.differentiable)
         parameters = {term: stiffness * (1.0 + moved["stiffness"])}
         for mass in masses:

@@ -308,6 +308,35 @@ def elements_at(host, dofs: SupportDofs, k: np.ndarray, column: np.ndarray) -> t
     return tuple(np.concatenate(values) for values in zip(*found, strict=True))
 
 
+def coupled_elements_at(host, dofs: SupportDofs, normals: NormalMoments) -> tuple:
+    """Return the elements of the coupled system next to supports.
+
+    Returns:
+        The elements of each set, numbered consecutively as columns; entry, column and local node of all pairs of a fixed place and an
+        element; and the columns of `normals`.
+    """
+    order = np.argsort(dofs.place, kind="stable")
+    places, listed, pairs = dofs.place[order], [], [np.zeros((3, 0), int)]
+    columns, first = np.zeros(len(normals), int), 0
+    for index, element_set in enumerate(host.sets):
+        of_normals = normals.element[:, 0] == index
+        at_supports = np.isin(element_set.slots, places)
+        wanted = at_supports.any(0)
+        wanted[normals.element[of_normals, 1]] = True
+        elements = np.flatnonzero(wanted)
+        local, column = np.nonzero(at_supports[:, elements])
+        block = element_set.slots[local, elements[column]]
+        begin, count = np.searchsorted(places, block), np.searchsorted(places, block, "right")
+        count -= begin
+        each = np.repeat(np.arange(len(block)), count)
+        offset = np.arange(len(each)) - np.repeat(np.cumsum(count) - count, count)
+        pairs.append(np.stack([order[begin[each] + offset], first + column[each], local[each]]))
+        columns[of_normals] = first + np.searchsorted(elements, normals.element[of_normals, 1])
+        listed.append(elements)
+        first += len(elements)
+    return listed, *np.concatenate(pairs, axis=1), columns
+
+
 class CoupledReactions(_Reactions):
     """Reactions at the fixed dofs of the coupled system, moments on prescribed shell normals, and forces on obstacles."""
 
@@ -315,36 +344,22 @@ class CoupledReactions(_Reactions):
         super().__init__(model, coupled, dofs, origins)
         host, scene, real = coupled.host, model.scene, self._real
         normals = NormalMoments.of(host, len(scene.supports), len(scene.shell_supports))
-        order = np.argsort(dofs.place, kind="stable")
-        places, self._sets, first, targets, items = dofs.place[order], [], 0, [], []
-        self._columns = np.zeros(len(normals), int)
-        for index, element_set in enumerate(host.sets):
-            of_normals = normals.element[:, 0] == index
-            at_supports = np.isin(element_set.slots, places)
-            wanted = at_supports.any(0)
-            wanted[normals.element[of_normals, 1]] = True
-            listed = np.flatnonzero(wanted)
-            local, column = np.nonzero(at_supports[:, listed])
-            block = element_set.slots[local, listed[column]]
-            begin, end = np.searchsorted(places, block), np.searchsorted(places, block, "right")
-            each = np.repeat(np.arange(len(block)), end - begin)
-            offset = np.arange(len(each)) - np.repeat(np.cumsum(end - begin) - (end - begin), end - begin)
-            targets.append(order[begin[each] + offset])
-            items.append((first + column[each]) * ROWS + local[each])
-            self._columns[of_normals] = first + np.searchsorted(listed, normals.element[of_normals, 1])
-            storage, rows = coupled_storage(coupled.sets[index].term, real), len(element_set.slots)
-            kernel = support_forces.element_force_kernel(storage, 0, storage.slots, rows, real)
-            if len(listed):
-                self._sets.append((index, self._pairs(np.stack([0 * listed, listed], -1)), first, kernel))
-            first += len(listed)
-        none = np.zeros(0, int)
-        self._gather(np.concatenate([none, *targets]), np.concatenate([none, *items]), first)
+        listed, target, column, local, columns = coupled_elements_at(host, dofs, normals)
+        total = sum(map(len, listed))
+        self._gather(target, column * ROWS + local, total)
+        self._sets, first = [], 0
+        for index, elements in enumerate(listed):
+            storage, rows = coupled_storage(coupled.sets[index].term, real), len(host.sets[index].slots)
+            if len(elements):
+                kernel = support_forces.element_force_kernel(storage, 0, storage.slots, rows, real)
+                self._sets.append((index, self._pairs(np.stack([0 * elements, elements], -1)), first, kernel))
+            first += len(elements)
         rows = max(len(element_set.slots) for element_set in host.sets)
-        self._values = wp.zeros((rows, first * model.worlds), dtype=self._vector, device=self._device)
+        self._values = wp.zeros((rows, total * model.worlds), dtype=self._vector, device=self._device)
         self._react, self.kernels = None, [kernel for *_, kernel in self._sets]
         self._normals = self._obstacles = None
         if len(normals):
-            self._normals = _Normals(self, model, coupled, normals, self._columns, first)
+            self._normals = _Normals(self, model, coupled, normals, columns, total)
             self.runs.append(self._normals.runs)
             self.kernels += self._normals.kernels
         if host.contact_parameters and scene.obstacles:
