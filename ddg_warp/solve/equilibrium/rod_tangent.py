@@ -27,18 +27,34 @@ class RodTangent(TangentBlock):
     """Tangent block of one rod group; dofs are numbered node by node, rod by rod. See `Tangent` for the methods."""
 
     def __init__(self, model, group, offset: int):
-        kind, real, device = group.kind, model.types.real, model.wp_device
-        shape = (group.nodes, group.columns)
+        kind = group.kind
         super().__init__(model, group, offset, group.columns * group.nodes * kind.block)
         self.group, self.block = group, kind.block
         self.body_count = self.islands = group.columns
         self.rate = group.still  # inverse time of strain-rate damping: zero at rest
-        self.incidence = _incidence(group)
         self.free = _free(group)
         self.angle = np.tile(np.arange(kind.block) >= kind.dim, group.columns * group.nodes)
-        self._windows = device_arrays.allocate((kind.window, *shape), real, device)
-        self._energies = device_arrays.allocate(shape, real, device)
-        self._hessian = device_arrays.allocate((kind.window**2, *shape), real, device)
+
+    @cached_property
+    def incidence(self) -> sparse.csr_matrix:
+        """Matrix from dofs to windows of elements."""
+        return _incidence(self.group)
+
+    @cached_property
+    def _windows(self) -> wp.array:
+        return self._allocate(self.group.kind.window)
+
+    @cached_property
+    def _energies(self) -> wp.array:
+        return self._allocate()
+
+    @cached_property
+    def _hessian(self) -> wp.array:
+        return self._allocate(self.group.kind.window**2)
+
+    def _allocate(self, *rows: int) -> wp.array:
+        shape = (*rows, self.group.nodes, self.group.columns)
+        return device_arrays.allocate(shape, self.model.types.real, self.model.wp_device)
 
     def accelerations(self, gravity: np.ndarray) -> np.ndarray:
         return np.append(gravity[list(self.host.axes)], 0.0)[None, : self.group.kind.block]

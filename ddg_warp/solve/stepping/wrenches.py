@@ -1,6 +1,7 @@
 """Wrenches of steps: force and moment at every support, grip and obstacle; see `kernels.residual.support_forces`."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import warp as wp
@@ -204,8 +205,9 @@ class _Reactions:
         entries.share = wp.array(dofs.share, dtype=wp.types.matrix((3, 3), self._real), device=self._device)
         entries.origin = wp.array(origins[dofs.support], dtype=self._vector, device=self._device)
 
+    @cached_property
     def _at_rest(self) -> list:
-        """Return arrays of islands that have accepted a step without inertia."""
+        """Arrays of islands that have accepted a step without inertia."""
         islands = Islands(self.part.columns, self._real, self._device)
         islands.substep_accepted.fill_(1)
         islands.substep_fraction.fill_(1.0)
@@ -288,7 +290,7 @@ class RodReactions(_Reactions):
         moment = device_arrays.upload(np.ascontiguousarray(load[..., -1]), self._real, self._device)
         weightless = wp.zeros(1, dtype=vector, device=self._device)
         values = self.evaluate(group.element_inputs(state, state.last))
-        inputs = [self._entries, values, group.mass, group.rotary, *self._at_rest(), state.x, state.theta, state.frame]
+        inputs = [self._entries, values, group.mass, group.rotary, *self._at_rest, state.x, state.theta, state.frame]
         inputs += [state.x, state.theta, weightless, force, moment, 1, 1]
         kernel, outputs = support_forces.rod_reaction_kernel(kind, self._real), [self._nodal.force, self._nodal.moment]
         self._launch(kernel, len(outputs[0]), inputs, outputs)
@@ -400,7 +402,7 @@ class CoupledReactions(_Reactions):
 
     def add_static(self, state, load: np.ndarray) -> None:
         """Add the reactions at a state; see `Wrenches.at`."""
-        coupled, islands = self.part, self._at_rest()
+        coupled, islands = self.part, self._at_rest
         inputs = inputs_type(self._real, False)()
         inputs.q = inputs.base = inputs.target = state.q
         inputs.mass, inputs.blocks, inputs.nodes = coupled.mass, coupled.blocks, coupled.host.nodes
