@@ -352,3 +352,11 @@ def test_wrenches_must_be_watched(device):
     pendulum(scene)
     with pytest.raises(ddg.SceneError, match="watch_wrenches"):
         ddg.Integrator(scene.build(device)).wrenches()
+
+
+def test_scenes_without_supports_have_no_wrenches(device):
+    scene = ddg.Scene()
+    scene.add_rod(line((0, 0, 0), (0.5, 0, 0)), section=SECTION, material=RUBBER)
+    integrator, _, after = run(scene, device, steps=1)
+    assert integrator.wrenches() == []
+    assert integrator.model.reactions(after) == []

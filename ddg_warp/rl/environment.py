@@ -168,8 +168,7 @@ class Environment:
         if wrenches:
             engine = simulator.engine(self.worlds)
             self._constant = bool(without_gradient(engine))
-            if self._constant:
-                engine.integrator.watch_wrenches()
+            engine.integrator.watch_wrenches()
         self._start = simulator.initial_state(self.worlds) if start is None else start
         first = self.begin(self.generators(0))
         self.observations, self.observation_dtype = self.observe(first).shape[1], self.observe(first).dtype
@@ -256,7 +255,7 @@ class Environment:
 
     def _wrenches_of(self, before: WorldState, after: WorldState, poses: torch.Tensor) -> WrenchTensors:
         """Return the wrenches of the step that was just made."""
-        if self._constant:
+        if self._constant or not any(value.requires_grad for value in after.values):
             return WrenchTensors.watched(after.engine)
         return self.simulator.wrenches(before, after, self.parameters, {"poses": poses})
 
