@@ -61,6 +61,16 @@ class SupportDofs:
         )
 
 
+def matches(values: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices (i, j) of all pairs with values[i] == others[j], by i."""
+    order = np.argsort(others, kind="stable")
+    ordered = others[order]
+    first, count = np.searchsorted(ordered, values), np.searchsorted(ordered, values, "right")
+    count = count - first
+    each = np.repeat(np.arange(len(values)), count)
+    return each, order[first[each] + np.arange(len(each)) - np.repeat(np.cumsum(count) - count, count)]
+
+
 def _nodes(host: DofStorage, places: np.ndarray) -> np.ndarray:
     """Return both nodes of the edges of twist angles, and nodes twice (n, 2)."""
     result = np.stack([places, places], -1)

@@ -7,12 +7,13 @@ continue through the step.
 
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
 import warp as wp
 
-from ddg_warp.compile.support_dofs import NormalMoments, SupportDofs
+from ddg_warp.compile.support_dofs import NormalMoments, SupportDofs, matches
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.adjoint.element_forces import force_kernels
 from ddg_warp.kernels.forces import drag
@@ -146,6 +147,9 @@ def without_gradient(engine) -> str:
         "the midpoint rule": engine.midpoint,
         "friction": contact is not None and contact.has_friction,
         "gyroscopic couples": engine.integrator.gyroscopic,
+        "a magnetic field": model.magnetic,
+        "shell normals that a grip turns": model.coupled is not None
+        and any(model.motions[i] in model.grips for part in model.coupled.sets for i in part.turning[:, 2]),
         "follower loads on supports": any(
             np.isin(load.places, places).any()
             for part, places in zip(parts, fixed, strict=True)
@@ -215,7 +219,7 @@ class _Part:
         self.engine, self.model, self.number, self.part, self.dofs = engine, engine.model, number, part, dofs
         self._device, self._real = engine.device, wp.dtype_to_torch(engine.model.types.real)
         self._worlds = torch.arange(engine.model.worlds, device=self._device)[:, None]
-        self._support, self._is_angle = self._long(dofs.support), torch.as_tensor(dofs.is_angle, device=self._device)
+        self._support = self._long(dofs.support)
         self._share, self._first = self._numbers(dofs.share), self._long(dofs.first)
         self._nodes, self._angles = np.flatnonzero(~dofs.is_angle), np.flatnonzero(dofs.is_angle)
 
@@ -251,16 +255,18 @@ class _Part:
             if name not in ("forces", "moments"):
                 continue
             values = values if name == "forces" else torch.stack([values, 0.0 * values, 0.0 * values], -1)
-            places, rows = loaded_rows(self.model, self.part)
-            chosen = (places < host.nodes) == (name == "forces")
-            order = np.argsort(self.dofs.place, kind="stable")
-            hits = (
-                np.searchsorted(self.dofs.place[order], places[chosen]),
-                np.searchsorted(self.dofs.place[order], places[chosen], "right"),
-            )
-            for row, begin, end in zip(rows[chosen], *hits, strict=True):
-                for entry in order[begin:end]:
-                    result = result.index_add(1, self._long([entry]), values[:, row : row + 1])
+            entry, row = self._loaded[name]
+            result = result.index_add(1, entry, values.index_select(1, row))
+        return result
+
+    @cached_property
+    def _loaded(self) -> dict[str, tuple]:
+        """Entries, and the user's row of points or edges of each, by name of a control load."""
+        places, rows = loaded_rows(self.model, self.part)
+        result = {}
+        for name, some in (("forces", self._nodes), ("moments", self._angles)):
+            i, j = matches(self.dofs.place[some], places)
+            result[name] = self._long(some[i]), self._long(rows[j])
         return result
 
     def _gravity(self, controls: dict) -> torch.Tensor:

@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import device_arrays
-from ddg_warp.compile.support_dofs import NormalMoments, SupportDofs
+from ddg_warp.compile.support_dofs import NormalMoments, SupportDofs, matches
 from ddg_warp.kernels.collision.contact.obstacle_forces import obstacle_kernel, pairs_type
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.elements.coupled_element import coupled_storage
@@ -317,22 +317,16 @@ def coupled_elements_at(host, dofs: SupportDofs, normals: NormalMoments) -> tupl
         The elements of each set, numbered consecutively as columns; entry, column and local node of all pairs of a fixed place and an
         element; and the columns of `normals`.
     """
-    order = np.argsort(dofs.place, kind="stable")
-    places, listed, pairs = dofs.place[order], [], [np.zeros((3, 0), int)]
-    columns, first = np.zeros(len(normals), int), 0
+    listed, pairs, columns, first = [], [np.zeros((3, 0), int)], np.zeros(len(normals), int), 0
     for index, element_set in enumerate(host.sets):
         of_normals = normals.element[:, 0] == index
-        at_supports = np.isin(element_set.slots, places)
+        at_supports = np.isin(element_set.slots, dofs.place)
         wanted = at_supports.any(0)
         wanted[normals.element[of_normals, 1]] = True
         elements = np.flatnonzero(wanted)
         local, column = np.nonzero(at_supports[:, elements])
-        block = element_set.slots[local, elements[column]]
-        begin, count = np.searchsorted(places, block), np.searchsorted(places, block, "right")
-        count -= begin
-        each = np.repeat(np.arange(len(block)), count)
-        offset = np.arange(len(each)) - np.repeat(np.cumsum(count) - count, count)
-        pairs.append(np.stack([order[begin[each] + offset], first + column[each], local[each]]))
+        each, entry = matches(element_set.slots[local, elements[column]], dofs.place)
+        pairs.append(np.stack([entry, first + column[each], local[each]]))
         columns[of_normals] = first + np.searchsorted(elements, normals.element[of_normals, 1])
         listed.append(elements)
         first += len(elements)
