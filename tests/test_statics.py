@@ -11,6 +11,8 @@ from ddg_warp.geometry import meshes
 from ddg_warp.run.simulate import simulate
 from ddg_warp.run.summary import summary
 from ddg_warp.solve.equilibrium import stability
+from ddg_warp.solve.equilibrium.continuation import Continuation, Displacement, StopCriterion
+from ddg_warp.solve.equilibrium.dynamic_relaxation import relax
 from ddg_warp.solve.equilibrium.stability import spectrum
 from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions, solve
 from ddg_warp.solve.equilibrium.tangent import Tangent
@@ -268,6 +270,41 @@ def test_reaction_is_the_weight_and_the_start_is_kept(device, mode):
     np.testing.assert_allclose(reaction.force, (0.0, 0.0, 0.5 * 9.81), atol=1e-7)
     again = solve(model, equilibrium, start=1.0, mode=mode)
     np.testing.assert_allclose(again.points(), equilibrium.points(), atol=1e-9)
+
+
+@pytest.mark.parametrize("search", ["solve", "conjugate gradients", "trace", "relax"])
+def test_a_viscous_structure_rests_in_equilibrium(device, search):
+    """Take a first step from an equilibrium under gravity: strains do not change, so strain-rate damping gives no force.
+
+    Without the strains of the equilibrium the damping force would be that of the whole deflection within one step.
+    """
+    scene = ddg.Scene(gravity=(0.0, 0.0, -9.81))
+    rod = scene.add_rod(
+        straight(9), section=ddg.Circle(0.01), material=ddg.Material(1e7, density=1000.0, viscosity=0.05)
+    )
+    scene.clamp(rod)
+    if search == "conjugate gradients":  # of coupled systems
+        scene.join([(rod, -1), (scene.add_rod(straight(5) + [1.0, 0.0, 0.0], section=SECTION), 0)])
+    model = scene.build(device, "float64")
+    if search == "trace":
+        state = (
+            Continuation(model, {"drop": Displacement.of(8, "z", -1.0)})
+            .trace(stop=StopCriterion(steps=3))
+            .points[-1]
+            .state
+        )
+    elif search == "relax":
+        state = relax(model)
+    else:
+        state = solve(model, load_steps=2, rtol=1e-10, solver="pcg" if search == "conjugate gradients" else "auto")
+    expected = state.copy()
+    model.update_strains(expected)
+    for name, array in state.arrays().items():
+        np.testing.assert_array_equal(array.numpy(), expected.arrays()[name].numpy(), name)
+    if search != "trace":  # it ends at another load parameter
+        after = ddg.Integrator(model).step(state, 0.01)
+        deflection = np.abs(state.points() - model.state().points()).max()
+        assert np.abs(after.points() - state.points()).max() < 1e-6 * deflection
 
 
 # Every node in equilibrium: the horizontal force is constant, the vertical force grows by the weight of a node.

@@ -255,6 +255,7 @@ class Corrector:
         arclength = origin.arclength + abs(self.dot(total, origin.direction))
         negative = stability.instabilities(tangent, state, stiffness)
         state.stable = negative == 0
+        tangent.model.update_strains(state)
         return Point(state, float(load), arclength, values, negative, REGULAR, direction, iterations=iteration)
 
     def _contact_energy(self, state: State) -> float:

@@ -56,6 +56,7 @@ def relax(
         first = equilibrium.residuals.first_scale(outer, gradient) if first is None else first
         scale = np.maximum(first, equilibrium.residuals.load_scale(outer, gradient))
         if (np.abs(force) <= residual * equilibrium.residuals.allowed(scale)).all():
+            model.update_strains(state)
             return state
         if mass is None:
             mass = _masses(tangent, state)

@@ -474,6 +474,7 @@ class Equilibrium:
         state.outcome, state.unbalanced = (
             values if model.worlds > 1 else values[0].item() for values in (outcomes, unbalanced)
         )
+        model.update_strains(state)  # a first time step finds a structure at rest
         return state
 
     def _with_supports_moved(self, state: State, before: float, load_factor: float) -> State:
