@@ -76,7 +76,7 @@ class PCG:
         self._unread = [wp.zeros(worlds, dtype=int, device=device) for _ in range(2)]
         self.sum = Sums(worlds, coupled.blocks, linear, device)
         self._invert, self._start, self._begin, *self._cycle = coupled_pcg.solver_kernels(
-            linear, indefinite, sparsity.has_angles, device_arrays.serial(device)
+            linear, indefinite, sparsity.has_angles, not self.sum.device.is_cuda
         )
         self._more = contact.diagonal if contact else wp.zeros(0, dtype=M, device=device)
         self.levels = Multilevel(coupled, sparsity, linear) if multilevel else None

@@ -120,7 +120,7 @@ class Sums:
 
     def __init__(self, worlds: int, n: int, real, device, largest: bool = False):
         self.device = wp.get_device(device)
-        serial = device_arrays.serial(device)
+        serial = not self.device.is_cuda  # only there a block has several threads
         self._tiles = max(1, -(-n // coupled_pcg.TILE))
         self._threads = worlds if serial else worlds * self._tiles * coupled_pcg.THREADS
         self._partial = wp.zeros(worlds * self._tiles, dtype=real, device=device)

@@ -316,7 +316,7 @@ def _run(group) -> int:
     """
     if group.kind.serial:
         return group.nodes
-    resident = wp.get_device(group.device).sm_count * RESIDENT
+    resident = max(1, wp.get_device(group.device).sm_count) * RESIDENT
     runs = np.arange(1, group.nodes + 1)
     nodes = -(-group.nodes // runs)
     waves = -(-group.columns * runs // resident)
