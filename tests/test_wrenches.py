@@ -62,7 +62,7 @@ def sheet(scene, bending):
 
 
 def oblique(scene):
-    """Add a sheet on an oblique symmetry plane and one along an axis, whose edges share a corner."""
+    """Add a sheet on an oblique symmetry plane and one along an axis; a corner is common to their edges."""
     points, triangles = meshes.rectangle(5, 4, (0.4, 0.3))
     low, side = (np.flatnonzero(points[:, axis] < 1e-9) for axis in (0, 1))
     c, s = np.cos(0.6), np.sin(0.6)
@@ -74,7 +74,7 @@ def oblique(scene):
 
 
 def stiffened(scene):
-    """Add a clamped sheet with a rod on it."""
+    """Add a clamped sheet and a rod on top."""
     points, triangles = meshes.rectangle(5, 4, (0.4, 0.3))
     shell = scene.add_shell(points, triangles, thickness=4e-3, material=RUBBER)
     scene.clamp_boundary(shell, np.flatnonzero(points[:, 0] < 1e-9), motion=shake())
@@ -200,7 +200,7 @@ def test_wrenches_balance_momentum(device, name, scheme):
 @pytest.mark.parametrize("name", ["pendulum", "joined"])
 @pytest.mark.parametrize("scheme", [EULER, MIDPOINT])
 def test_wrenches_balance_drag_and_loads(device, scheme, name):
-    """Drag of a flow, a load in time, a couple and a twisting moment are part of the balance."""
+    """Include drag of a flow, a load in time, a couple and a twisting moment in the balance."""
     scene = ddg.Scene(gravity=(0.0, 0.2, -9.81), mass_damping=0.8, flow=(0.5, 0.2, 0.1))
     SCENES[name](scene)
     scene.drag([0], tangential=0.3, normal=0.8, rotational=1e-3)
@@ -246,7 +246,7 @@ OBSTACLES = {
 @pytest.mark.parametrize("name", OBSTACLES)
 @pytest.mark.parametrize("friction", [0.0, 0.4])
 def test_wrenches_of_obstacles(device, name, friction):
-    """Contact and friction on obstacles, moved ones too, are part of the balance."""
+    """Include contact and friction on obstacles, moved ones too, in the balance."""
     obstacle, motion = OBSTACLES[name]
     scene = lying(obstacle, 2, motion, friction=friction)
     integrator, before, after = run(scene, device, steps=1, rtol=1e-11)
@@ -262,7 +262,7 @@ def test_wrenches_of_obstacles(device, name, friction):
 
 
 def test_wrenches_of_decoupled_steps(device):
-    """Rods out of contact are stepped as uncoupled rods; the wrenches are those of the coupled system."""
+    """Step rods out of contact as uncoupled rods; wrenches equal the coupled system's."""
     scene = lying(ddg.Plane(), 3, height=0.2)
     integrator, before, after = run(scene, device)
     assert integrator._coupled.decoupled
@@ -273,14 +273,14 @@ def test_wrenches_of_decoupled_steps(device):
     state = integrator.model.state()
     for _ in range(STEPS):
         state = whole.step(state, DT)
-    for one, other in zip(integrator.wrenches(), whole.wrenches(), strict=True):
-        np.testing.assert_allclose(one.force, other.force, atol=1e-8)
-        np.testing.assert_allclose(one.moment, other.moment, atol=1e-9)
-        np.testing.assert_allclose(one.point, other.point, atol=1e-12)
+    for one, expected in zip(integrator.wrenches(), whole.wrenches(), strict=True):
+        np.testing.assert_allclose(one.force, expected.force, atol=1e-8)
+        np.testing.assert_allclose(one.moment, expected.moment, atol=1e-9)
+        np.testing.assert_allclose(one.point, expected.point, atol=1e-12)
 
 
 def test_wrenches_are_means_over_substeps(device):
-    """After retries with substeps, the mean wrench balances the momentum of the whole step."""
+    """Compare the mean wrench over substeps with the change of momentum."""
     scene = ddg.Scene(gravity=(0.3, 0.2, -9.81))
     pendulum(scene)
     integrator, before, after = run(scene, device, steps=3, dt=0.1, max_iterations=4, rtol=1e-9)
@@ -315,7 +315,7 @@ def test_wrenches_of_equilibria_are_reactions(device, name):
 
 @pytest.mark.parametrize("name", ["pinned", "joined", "midedge_dof", "lying"])
 def test_worlds_have_the_wrenches_of_single_models(device, name):
-    """Wrenches of worlds equal those of a model of one world bit by bit, and repeat."""
+    """Compare wrenches of worlds with a model of one world, bit by bit, and with a repetition."""
     scene = ddg.Scene(gravity=(0.3, 0.2, -9.81), mass_damping=0.8)
     if name == "lying":
         scene = lying(*OBSTACLES["box"][:1], 2, friction=0.3)

@@ -1,4 +1,4 @@
-"""Dofs that supports fix, with the share of each support, for reactions and wrenches."""
+"""Dofs that supports fix, with the fraction of each support, for reactions and wrenches."""
 
 from dataclasses import dataclass
 
@@ -13,10 +13,11 @@ class SupportDofs:
 
     Attributes:
         support: index of the support (n,), ascending.
-        place: node or twist angle (n,).
+        `place`: index of the node or twist angle (n,).
         is_angle: mask of twist angles (n,).
         ends: both nodes of the edge of a twist angle, else the node itself (n, 2).
-        share: (n, 3, 3) part of the reaction of a node that the support carries. A dof fixed by several supports counts for the first.
+        `share`: (n, 3, 3) projection of the reaction of a node on the components that the support carries. A dof fixed by several
+            supports counts for the first.
         first: supports with a dof here (m,); reference: first node of each (m,).
     """
 
@@ -34,25 +35,25 @@ class SupportDofs:
     @classmethod
     def of(cls, host: DofStorage) -> "SupportDofs":
         """Return the dofs of the supports of a storage."""
-        fixed = np.unique(np.concatenate([np.zeros(0, int), *(held.places for held in host.held)]))
-        left = np.tile(np.eye(3), (len(fixed), 1, 1))  # part of each reaction that no support carries yet
+        fixed = np.unique(np.concatenate([np.zeros(0, int), *(constraint.places for constraint in host.held)]))
+        left = np.tile(np.eye(3), (len(fixed), 1, 1))  # components of each reaction that no support carries yet
         columns, first, reference = [], [], []
-        for number, held in enumerate(host.held):
-            if not len(held.places):
+        for number, constraint in enumerate(host.held):
+            if not len(constraint.places):
                 continue
-            places, start, owner = np.unique(held.places, return_index=True, return_inverse=True)
+            places, start, owner = np.unique(constraint.places, return_index=True, return_inverse=True)
             taken = np.zeros((len(places), 3, 3))
-            if held.normal is None:
-                taken[owner, held.components, held.components] = 1.0
+            if constraint.normal is None:
+                taken[owner, constraint.components, constraint.components] = 1.0
             else:
-                taken[:] = np.outer(held.normal, held.normal)
+                taken[:] = np.outer(constraint.normal, constraint.normal)
             rows = np.searchsorted(fixed, places)
             share = taken @ left[rows]
             left[rows] -= share
             order = np.argsort(start)
             columns.append((np.full(len(places), number), places[order], share[order]))
             first.append(number)
-            reference.append(held.places[0])
+            reference.append(constraint.places[0])
         none = np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3, 3))
         support, place, share = (np.concatenate(values) for values in zip(none, *columns, strict=True))
         first, reference = np.array(first, int), np.array(reference, int)
@@ -61,10 +62,10 @@ class SupportDofs:
         )
 
 
-def matches(values: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices (i, j) of all pairs with values[i] == others[j], by i."""
-    order = np.argsort(others, kind="stable")
-    ordered = others[order]
+def matches(values: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices (i, j) of all pairs with values[i] == targets[j], by i."""
+    order = np.argsort(targets, kind="stable")
+    ordered = targets[order]
     first, count = np.searchsorted(ordered, values), np.searchsorted(ordered, values, "right")
     count = count - first
     each = np.repeat(np.arange(len(values)), count)
@@ -89,7 +90,7 @@ class NormalMoments:
     Attributes:
         support: index of the support (n,), ascending.
         element: element set and element (n, 2).
-        corner: first corner of the mesh edge among those of the triangle; -1 if one support carries the whole moment, at one entry.
+        corner: first corner of the mesh edge, by its index in the triangle; -1 if one support carries the whole moment, at one entry.
     """
 
     support: np.ndarray
@@ -101,7 +102,7 @@ class NormalMoments:
 
     @classmethod
     def of(cls, host: DofStorage, first: int, count: int) -> "NormalMoments":
-        """Return the normals of a coupled system prescribed by its `count` supports of shells, the first with index `first`."""
+        """Return the prescribed normals of a coupled system, of `count` supports of shells from index `first` on."""
         rows = [np.zeros((0, 4), int)]
         for index, element_set in enumerate(getattr(host, "sets", ())):
             element, row, support = element_set.normals[:, element_set.normals[2] < count]

@@ -147,7 +147,7 @@ class Model:
 
     @cached_property
     def static_wrenches(self):
-        """Sums of reactions over supports at given states (`Wrenches`)."""
+        """`Wrenches` for sums of reactions over supports at states."""
         from ddg_warp.solve.stepping.wrenches import Wrenches
 
         return Wrenches(self)

@@ -37,7 +37,7 @@ def energies(model, state) -> dict:
 
 @launches
 def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
-    """Return the reaction of every support of the scene at a state; `Integrator.wrenches` returns those of a step.
+    """Return the reaction of every support of the scene at a state; `Integrator.wrenches` is for a step.
 
     Supports are ordered as added: of rods, then of shells, rings and obstacles.
 

@@ -179,12 +179,12 @@ class Simulator(torch.nn.Module):
     ) -> WrenchTensors:
         """Return the wrenches of supports and grips in the step from `before` to `after`, with gradients by all arguments.
 
-        Gradients by `after` continue through the step. Parameters and controls must be those of the step. See
-        `Integrator.watch_wrenches` for the meaning of wrenches; worlds whose step was split into substeps have other ones.
+        Gradients by `after` continue through the step, whose parameters and controls must be given. See `Integrator.watch_wrenches` for
+        the meaning of wrenches. Worlds whose step was split into substeps have other ones.
 
         Raises:
-            SceneError: the scheme is the midpoint rule, the model has friction or follower loads on supports, a parameter is of drag
-                or contact, or a name or shape does not fit.
+            SceneError: the scheme is the midpoint rule. The model has friction or follower loads on supports. A parameter is of drag or
+                contact. A name or shape does not fit.
         """
         engine = self._own(after)
         if self._own(before) is not engine:

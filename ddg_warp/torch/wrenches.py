@@ -45,15 +45,15 @@ class WrenchTensors:
 
     @classmethod
     def watched(cls, engine) -> "WrenchTensors":
-        """Return the wrenches of the last step of an engine that watches them, without gradient."""
+        """Return the watched wrenches of an engine's last step, without gradient."""
         watched = engine.integrator.watched_wrenches
         return cls(*(view(values).clone() for values in (watched.force, watched.moment, watched.point)))
 
-    def where(self, mask: torch.Tensor, other: "WrenchTensors") -> "WrenchTensors":
-        """Select these wrenches in worlds of a mask (B,), others elsewhere."""
+    def where(self, mask: torch.Tensor, elsewhere: "WrenchTensors") -> "WrenchTensors":
+        """Select by a mask of worlds (B,) between two wrenches."""
         mask = mask[:, None, None]
         return WrenchTensors(
-            *(torch.where(mask, a, b) for a, b in zip(vars(self).values(), vars(other).values(), strict=True))
+            *(torch.where(mask, a, b) for a, b in zip(vars(self).values(), vars(elsewhere).values(), strict=True))
         )
 
 
@@ -94,7 +94,7 @@ def _launch(term, index: int, inputs, outputs) -> None:
 
 
 def _torch_stream(like: torch.Tensor):
-    """Return a context in which Warp launches on torch's stream."""
+    """Return a context for Warp launches on torch's stream."""
     if not like.is_cuda:
         return nullcontext()
     return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(like.device)))
@@ -139,7 +139,7 @@ def _evaluate_contact(model, rate: torch.Tensor, q: torch.Tensor) -> wp.array:
 
 
 def without_gradient(engine) -> str:
-    """Return the feature of an engine's steps whose wrenches have no gradient; empty for none."""
+    """Return the feature that leaves wrenches without gradient; empty for none."""
     model, parts = engine.model, _parts(engine.model)
     contact = model.coupled and model.coupled.host.contact_parameters
     fixed = [SupportDofs.of(part.host).place for part in parts]
@@ -185,27 +185,27 @@ class Wrenches:
 
     def __call__(self, before, after, parameters: list, controls: dict, dt: float) -> WrenchTensors:
         """Return the wrenches of a step of dt [s] between two `WorldState`."""
-        given, summed = {}, {}
+        parameter_tensors, summed = {}, {}
         for name, tensors in parameters:
             for place, values in zip(self.engine.tables.of(name)[1], tensors, strict=True):
                 if isinstance(place, TermParameterView):
-                    given[place.index, place.is_rod_group, place.name] = values
+                    parameter_tensors[place.index, place.is_rod_group, place.name] = values
                 elif getattr(place, "weighs", False):
                     summed.setdefault((place.index, place.is_rod_group, place.key[1]), []).append((place, values))
                 else:
                     raise SceneError(f"wrenches: no gradient goes through wrenches by {name}; leave it out")
-        given |= {key: entries[0][0].total(entries) for key, entries in summed.items()}
+        parameter_tensors |= {key: entries[0][0].total(entries) for key, entries in summed.items()}
         worlds, like = self.model.worlds, before.values[0]
         force, moment, point = (like.new_zeros((worlds, self._count, 3)) for _ in range(3))
         states = [
             {field.name: value for field, value in zip(self.engine.fields, state.values, strict=True)}
             for state in (before, after)
         ]
-        for part in reversed(self._parts):  # the first part of a support with several gives its point
+        for part in reversed(self._parts):  # the first subsystem of a support gives its point
             nodes, x = part.references(states[1])
             point = point.index_copy(1, nodes, x)
         for part in self._parts:
-            for support, f, arm, m in part(states, given, controls, dt, before.time + dt):
+            for support, f, arm, m in part(states, parameter_tensors, controls, dt, before.time + dt):
                 if len(support):
                     force = force.index_add(1, support, f)
                     moment = moment.index_add(1, support, m + torch.linalg.cross(arm - point[:, support], f))
@@ -230,14 +230,14 @@ class _Part:
         return torch.as_tensor(np.array(values, float), dtype=self._real, device=self._device)
 
     def _index(self, places) -> torch.Tensor:
-        """Return the indices of places in flat arrays of nodes, or of angles, of all worlds (worlds, ...)."""
+        """Return indices (worlds, ...) in flat arrays of nodes, or of angles, of all worlds."""
         raise NotImplementedError
 
     def _flat(self, state: dict, name: str) -> torch.Tensor:
         """Return vectors in space of all nodes or angles of all worlds."""
         raise NotImplementedError
 
-    def _mass(self, is_node: bool, given: dict) -> torch.Tensor:
+    def _mass(self, is_node: bool, parameter_tensors: dict) -> torch.Tensor:
         """Return masses of all nodes, or rotary inertia of all angles, (n, 1) or (n, 3)."""
         raise NotImplementedError
 
@@ -246,7 +246,7 @@ class _Part:
         return self._first, self._flat(state, "x")[self._index(self.dofs.reference)]
 
     def _loads(self, time: float, controls: dict) -> torch.Tensor:
-        """Return loads on the fixed places (worlds, n, 3), without gravity."""
+        """Return loads on the fixed dof blocks (worlds, n, 3), without gravity."""
         host, total = self.part.host, np.zeros((self.part.host.size, 3))
         for load in (host.constant, *host.timed):
             np.add.at(total, load.places, load.at(time, 1.0) * load.force)
@@ -274,14 +274,14 @@ class _Part:
         usual = self._numbers(self.model.scene.gravity)[None]
         return controls.get("gravity", usual).expand(len(self._worlds), 3)[:, None]
 
-    def _element_forces(self, states, given, dt: float) -> torch.Tensor:
+    def _element_forces(self, states, parameter_tensors, dt: float) -> torch.Tensor:
         """Return forces of the listed elements by local node (rows, worlds columns, 3)."""
         raise NotImplementedError
 
-    def __call__(self, states, given, controls, dt: float, time: float):
+    def __call__(self, states, parameter_tensors, controls, dt: float, time: float):
         """Yield supports, forces, points of attack and further moments (worlds, n, 3)."""
         before, after = states
-        elements = self._element_forces(states, given, dt)
+        elements = self._element_forces(states, parameter_tensors, dt)
         targets, column, local = self._items
         count, worlds = len(self.dofs), len(self._worlds)
         contributions = elements[local[None], column[None] + self._worlds * self._columns]
@@ -302,7 +302,7 @@ class _Part:
             change = self._flat(after, x)[places] - self._flat(before, x)[places]
             inertia = change * (rate * (rate + damping)) - self._flat(before, v)[places] * rate
             inertia = inertia - self._gravity(controls) if is_node else inertia
-            reaction = reaction.index_add(1, self._long(some), self._mass(is_node, given)[places] * inertia)
+            reaction = reaction.index_add(1, self._long(some), self._mass(is_node, parameter_tensors)[places] * inertia)
         nodes, angles = self._long(self._nodes), self._long(self._angles)
         force = torch.einsum("nij,wnj->wni", self._share[nodes], reaction[:, nodes])
         position = self._flat(after, "x")
@@ -320,7 +320,7 @@ class _Part:
         yield from ()
 
     def _contact(self, after: dict) -> torch.Tensor | None:
-        """Return contact forces on all places; None without contact."""
+        """Return contact forces on all dof blocks; None without contact."""
         return None
 
     @property
@@ -355,13 +355,13 @@ class _Part:
             turned = self._flat(after, "theta")[places] - theta[places]
             yield self._long(self._angles), spin[places][..., None] * turned
 
-    def _parameters(self, term, key: tuple, given, stored, pick) -> list[torch.Tensor]:
-        """Return rest measure and parameters (n,) of elements; `pick` selects those of an array in the layout of `given`."""
+    def _parameters(self, term, key: tuple, parameter_tensors, stored, pick) -> list[torch.Tensor]:
+        """Return rest measure and parameters (n,) of elements; `pick` selects them from an array as in `parameter_tensors`."""
         index, is_rod_group, prefix = key
         result = []
         for name in term.parameter_names:
             name = prefix + name
-            values = given.get((index, is_rod_group, name))
+            values = parameter_tensors.get((index, is_rod_group, name))
             result.append(pick(self._numbers(stored(name)) if values is None else values))
         return result
 
@@ -445,8 +445,8 @@ class _Rods(_Part):
             values = torch.stack([values[:, 0], 0.0 * values[:, 0], values[:, 1]], -1)
         return values
 
-    def _mass(self, is_node: bool, given: dict) -> torch.Tensor:
-        values = given.get((self.number, True, "mass" if is_node else "inertia"))
+    def _mass(self, is_node: bool, parameter_tensors: dict) -> torch.Tensor:
+        values = parameter_tensors.get((self.number, True, "mass" if is_node else "inertia"))
         values = view(self.part.mass if is_node else self.part.rotary) if values is None else values
         return values.reshape(-1, 1)
 
@@ -472,7 +472,7 @@ class _Rods(_Part):
         p = view(group.drag).reshape(drag.ROWS, -1)[:, first]
         return first, last, first if group.kind.twist else first * 0 - 1, p
 
-    def _element_forces(self, states, given, dt: float) -> torch.Tensor:
+    def _element_forces(self, states, parameter_tensors, dt: float) -> torch.Tensor:
         (before, after), group, kind = states, self.part, self.part.kind
         x = after[f"{self.number}/x"].reshape(-1, kind.dim)
         places, worlds = self._along, len(self._worlds)
@@ -493,7 +493,7 @@ class _Rods(_Part):
             w, *p = self._parameters(
                 term,
                 (self.number, True, f"{term.name}."),
-                given,
+                parameter_tensors,
                 lambda name: np.broadcast_to(group.parameters[name], (group.nodes, group.columns)),
                 lambda values, first=nodes[0]: values.expand(group.nodes, group.columns).reshape(-1)[first],
             )
@@ -558,8 +558,8 @@ class _Coupled(_Part):
     def _flat(self, state: dict, name: str) -> torch.Tensor:
         return state["net/q" if name in ("x", "theta") else "net/v"]
 
-    def _mass(self, is_node: bool, given: dict) -> torch.Tensor:
-        values = given.get((-1, False, "mass" if is_node else "inertia"))
+    def _mass(self, is_node: bool, parameter_tensors: dict) -> torch.Tensor:
+        values = parameter_tensors.get((-1, False, "mass" if is_node else "inertia"))
         if values is None:
             return view(self.part.mass).reshape(-1, 3)
         before = 0 if is_node else self.part.angle_start
@@ -592,7 +592,7 @@ class _Coupled(_Part):
         q = after["net/q"]
         return ContactForces.apply(self.model, after.get("net/rate", q.new_zeros(0)), q)
 
-    def _element_forces(self, states, given, dt: float) -> torch.Tensor:
+    def _element_forces(self, states, parameter_tensors, dt: float) -> torch.Tensor:
         (before, after), coupled, worlds = states, self.part, len(self._worlds)
         q, host = after["net/q"], self.part.host
         if host.spins:
@@ -627,7 +627,7 @@ class _Coupled(_Part):
             w, *p = self._parameters(
                 term,
                 (index, False, ""),
-                given,
+                parameter_tensors,
                 lambda name, part=part: np.broadcast_to(part.parameters[name], (worlds, part.elements)),
                 lambda values, element=element, part=part: values.expand(worlds, part.elements).reshape(-1)[element],
             )
@@ -650,6 +650,6 @@ class _Coupled(_Part):
                 normal = torch.linalg.cross(sides[0], -sides[2])
                 gram = normal[..., :, None] * normal[..., None, :] / normal.norm(dim=-1)[..., None, None]
                 gram = gram + torch.einsum("ne,ewni,ewnj->wnij", self._numbers(edges), sides, sides)
-                own = sides[self._long(corner), :, torch.arange(len(corner), device=x.device)].transpose(0, 1)
-                moment = own * (own * torch.linalg.solve(gram, moment)).sum(-1, keepdim=True)
+                edge = sides[self._long(corner), :, torch.arange(len(corner), device=x.device)].transpose(0, 1)
+                moment = edge * (edge * torch.linalg.solve(gram, moment)).sum(-1, keepdim=True)
             yield self._long(support), 0.0 * moment, corners[0], moment

@@ -1,8 +1,8 @@
 """Reactions of fixed dofs over a step: the residual there, which no solve makes zero.
 
 The solved residual of a node is external minus inertial minus internal force. At a fixed dof it is minus the reaction of the support.
-It holds damping, drag, inertia, contact and loads, and is the mean force over a solve, which balances the momentum of the step:
-at its end for implicit Euler, at its midpoint for the midpoint rule.
+It holds damping, drag, inertia, contact and loads. It is the mean force over a solve, which balances the momentum of the step: at its
+end for implicit Euler, at its midpoint for the midpoint rule.
 
 `element_force_kernel` evaluates the elements next to fixed dofs alone, at the solution. Reactions of substeps are weighted by their
 fraction of the step. Moments are about a constant point of each support.
@@ -136,7 +136,7 @@ def _add_functions(dim: int, real):
 
     `gathered(entries, elements, i, w)`: sum of element forces at an entry, in a fixed order.
     `lifted(v)`: vector in space of a vector of nodes.
-    `add(...)`: add force and moment of a reaction to those of earlier substeps, or replace them.
+    `add(...)`: add force and moment of a reaction to the sums of earlier substeps, or replace the sums.
     """
     Entries, V, X = entries_type(real), wp.types.vector(dim, real), wp.types.vector(3, real)
 
@@ -192,7 +192,7 @@ def _add_functions(dim: int, real):
 def rod_reaction_kernel(kind: RodKind, real):
     """Build the kernel of reactions on uncoupled rods.
 
-    `react`: add forces and moments of entries over an accepted substep, or replace those of earlier ones.
+    `react`: add forces and moments of entries over an accepted substep, or replace the sums of earlier ones.
     """
     dim, twist, drag = kind.dim, kind.twist, kind.drag
     V, X, Inertia, Entries = (
@@ -315,8 +315,8 @@ def normal_moment_kernel(real):
 
     `turn`: add moments of entries over an accepted substep; see `ddg_warp.compile.support_dofs.NormalMoments`.
 
-    With edges e_i of a triangle, the components c_i e_i of a moment m have least squares: c = E^T (E E^T + t n n^T)^-1 m, with the
-    unit normal n and any t > 0.
+    The components c_i e_i of a moment m along the edges e_i of a triangle have least squares. They are c = E^T (E E^T + t n n^T)^-1 m,
+    with the unit normal n and any t > 0.
     """
     X = wp.types.vector(3, real)
 
@@ -349,14 +349,14 @@ def normal_moment_kernel(real):
             b = q[corners[2, i] + shift] - q[corners[0, i] + shift]
             normal = wp.cross(a, b)
             gram = wp.outer(normal, normal) / wp.length(normal)
-            own = X()
+            side = X()
             for j in range(3):
                 edge = q[corners[(j + 1) % 3, i] + shift] - q[corners[j, i] + shift]
                 if (edges[i] >> j) & 1 == 1:
                     gram += wp.outer(edge, edge)
                 if j == corner[i]:
-                    own = edge
-            moment = own * wp.dot(own, wp.inverse(gram) * moment)
+                    side = edge
+            moment = side * wp.dot(side, wp.inverse(gram) * moment)
         moment_out[i, w] = moment_out[i, w] + moment * scalars[SUBSTEP_FRACTION, w]
 
     return turn

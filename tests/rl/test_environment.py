@@ -222,14 +222,14 @@ def test_seeds_are_as_large_as_those_of_numpy():
 
 def test_wrenches_are_observed_and_differentiable():
     """Episodes hold the wrenches of steps, zero at their start; rewards of them have gradients by actions."""
-    env = environment(wrenches=True, substeps=2, observe=lambda now: now.wrenches.force.flatten(1))
-    now = env.begin(env.generators(0))
-    assert now.wrenches.force.shape == (WORLDS, 1, 3)
-    assert not now.wrenches.force.any()
+    env = environment(wrenches=True, substeps=2, observe=lambda current: current.wrenches.force.flatten(1))
+    current = env.begin(env.generators(0))
+    assert current.wrenches.force.shape == (WORLDS, 1, 3)
+    assert not current.wrenches.force.any()
     actions = some_actions(1)[0]
 
     def loss(actions):
-        after = env.step(now, actions)
+        after = env.step(current, actions)
         return (after.wrenches.force[:, 0, 2] + after.wrenches.moment[:, 0, 1]).sum(), after
 
     moved = actions.clone().requires_grad_()
@@ -245,16 +245,16 @@ def test_wrenches_are_observed_and_differentiable():
 
 
 def test_wrenches_with_friction_are_constants():
-    """With friction, observed wrenches are those of the integrator, without gradient."""
+    """Compare observed wrenches in friction with the integrator's; they have no gradient."""
     scene = a_scene()
     rod = scene.add_rod(POINTS + [0.0, 0.0, 0.0045], section=ddg.Circle(0.004), material=SOFT)
     scene.clamp(rod, motion=ddg.Grip(pivot=(0.1, 0.0, 0.0)))
     scene.contact(friction=0.3)
     scene.add_obstacle(ddg.Plane())
     env = environment(Simulator(built(scene), DT), wrenches=True)
-    now = env.step(env.begin(env.generators(0)), (1e-3 * some_actions(1)[0]).requires_grad_())
-    assert not now.failed.any()
-    watched = now.world.engine.integrator.watched_wrenches
-    assert now.wrenches.force.shape == (WORLDS, 2, 3)
-    assert not now.wrenches.force.requires_grad
-    np.testing.assert_array_equal(now.wrenches.force.cpu().numpy(), watched.force.numpy())
+    current = env.step(env.begin(env.generators(0)), (1e-3 * some_actions(1)[0]).requires_grad_())
+    assert not current.failed.any()
+    watched = current.world.engine.integrator.watched_wrenches
+    assert current.wrenches.force.shape == (WORLDS, 2, 3)
+    assert not current.wrenches.force.requires_grad
+    np.testing.assert_array_equal(current.wrenches.force.cpu().numpy(), watched.force.numpy())

@@ -69,8 +69,8 @@ def test_tensors_are_the_wrenches_of_the_integrator(device, name):
     result = simulator.wrenches(before, after)
     if name == "pressed":
         assert result.force[0, -1, 2] > 1.0
-    for one, other in ((result.force, watched.force), (result.moment, watched.moment), (result.point, watched.point)):
-        expected = other.numpy()
+    for one, values in ((result.force, watched.force), (result.moment, watched.moment), (result.point, watched.point)):
+        expected = values.numpy()
         np.testing.assert_allclose(one.detach().cpu().numpy(), expected, atol=1e-9 * np.abs(expected).max())
 
 
@@ -144,8 +144,8 @@ def test_gradients_against_differences(device, name):
         with torch.no_grad():
             ends = [loss(**(inputs | {key: value + sign * step * direction})) for sign in (1.0, -1.0, 2.0, -2.0)]
         difference = float((8.0 * (ends[0] - ends[1]) - (ends[2] - ends[3])) / (12.0 * step))
-        found = float((moved[key].grad * direction).sum())
-        assert found == pytest.approx(difference, rel=1e-6), key
+        gradient = float((moved[key].grad * direction).sum())
+        assert gradient == pytest.approx(difference, rel=1e-6), key
 
 
 def test_models_without_gradients_are_refused(device):

@@ -461,7 +461,7 @@ class Integrator:
     def wrenches(self) -> list[Reaction]:
         """Return the force and moment that every support, grip and obstacle exerted in the last step. Reads from the device.
 
-        They are ordered as those of `Model.reactions`, and hold inertia, damping, drag and loads at the support; see `Wrenches`.
+        They are ordered as in `Model.reactions`, and hold inertia, damping, drag and loads at the support; see `Wrenches`.
 
         Raises:
             SceneError: `watch_wrenches` was not called before the step.

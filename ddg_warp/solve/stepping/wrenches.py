@@ -65,13 +65,13 @@ class Wrenches:
         parts = [*model.groups, *([model.coupled] if model.coupled is not None else [])]
         dofs = [SupportDofs.of(part.host) for part in parts]
         self._origins, owner = np.zeros((shape[1], 3)), np.full(shape[1], -1)
-        for number, (part, own) in reversed(list(enumerate(zip(parts, dofs, strict=True)))):
-            self._origins[own.first], owner[own.first] = part.host.points(own.reference), number
+        for number, (part, fixed) in reversed(list(enumerate(zip(parts, dofs, strict=True)))):
+            self._origins[fixed.first], owner[fixed.first] = part.host.points(fixed.reference), number
         self._origin = wp.array(self._origins, dtype=vector, device=device)
-        self._parts = [self._reactions(part, own) for part, own in zip(parts, dofs, strict=True)]
+        self._parts = [self._reactions(part, fixed) for part, fixed in zip(parts, dofs, strict=True)]
         self._references = [
-            _References(model, part, own, np.flatnonzero(owner == number), self._origin)
-            for number, (part, own) in enumerate(zip(parts, dofs, strict=True))
+            _References(model, part, fixed, np.flatnonzero(owner == number), self._origin)
+            for number, (part, fixed) in enumerate(zip(parts, dofs, strict=True))
         ]
         self._decoupled = []  # reactions of the rod groups of decoupled steps
 
@@ -80,7 +80,7 @@ class Wrenches:
         return kind(self._model, part, dofs, self._origins)
 
     def follow(self, coupled_step) -> None:
-        """Allocate what a `CoupledStep` needs, before a capture: lists of pairs, and rod groups of decoupled steps."""
+        """Allocate lists of pairs, and rod groups of decoupled steps, before a capture."""
         decoupled = coupled_step.decoupled
         groups = [rod_step.group for rod_step in decoupled.rod_steps] if decoupled else []
         if [part.part for part in self._decoupled] != groups:
@@ -101,12 +101,12 @@ class Wrenches:
     def add(self, step, start) -> None:
         """Add the reactions of the substep that a `RodStep` or `CoupledStep` has just solved from `start`; capturable.
 
-        Decoupled steps replace those of an earlier attempt.
+        Decoupled steps replace the reactions of an earlier attempt.
         """
-        own = getattr(step, "group", self._model.coupled)
+        stepped = getattr(step, "group", self._model.coupled)
         for parts, keeps in ((self._parts, 1), (self._decoupled, 0)):
             for part in parts:
-                if part.part is own:
+                if part.part is stepped:
                     part.add(step, start, keeps)
 
     def sum(self, after, decoupled) -> None:
@@ -128,8 +128,8 @@ class Wrenches:
             loads: external, contact and friction forces on the dofs of every rod group and of the coupled system, in space.
         """
         self.begin()
-        for part, own, load in zip(self._parts, [*state.groups, state.coupled], loads, strict=False):
-            part.add_static(own, load)
+        for part, values, load in zip(self._parts, [*state.groups, state.coupled], loads, strict=False):
+            part.add_static(values, load)
         self.sum(state, None)
         return self.values()
 
@@ -188,7 +188,7 @@ class _Reactions:
     """Reactions at the fixed dofs of a rod group or of the coupled system.
 
     Attributes:
-        part: `RodGroup` or `CoupledModel`.
+        `part`: the `RodGroup` or `CoupledModel`.
         runs: reactions of entries, to be summed over supports.
         kernels: kernels to load before a capture.
     """
@@ -227,7 +227,7 @@ class _Reactions:
         return wp.array(np.ascontiguousarray(values, np.int32), dtype=wp.vec2i, device=self._device)
 
     def _index(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return node or edge in its column, and column in a world, of places."""
+        """Return indices along a column, and columns in a world, of path nodes."""
         return _index(self.part, places)
 
     def clear(self) -> None:
@@ -241,7 +241,7 @@ class _Reactions:
 
 
 def _index(part, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return node or edge in its column, and column in a world, of places of a `RodGroup` or `CoupledModel`."""
+    """Return indices along a column, and columns in a world, of nodes or edges of a subsystem."""
     return np.divmod(part.host.index(places), part.world_columns)
 
 
@@ -265,14 +265,14 @@ class RodReactions(_Reactions):
         self.kernels = [*self._evaluate, self._react]
 
     def evaluate(self, inputs) -> wp.array:
-        """Evaluate the elements at supports with the inputs of element kernels; return their forces by local node; capturable."""
+        """Evaluate the elements at supports, and return their forces by local node; capturable."""
         count = len(self._listed)
         for kernel in self._evaluate:
             self._launch(kernel, count, [inputs, self._listed, self.part.rods, 0, count], [self._values])
         return self._values
 
     def add(self, step, start, keeps: int) -> None:
-        """Add the reactions of an accepted substep, or replace those before; capturable."""
+        """Add the reactions of an accepted substep, or replace the sums before; capturable."""
         group, newton, (flags, scalars) = self.part, step.newton, step.islands.arrays
         iterates, loading = newton.iterates, newton.loading
         values = self.evaluate(group.element_inputs(iterates, start.last, step.islands.inverse_step))
@@ -299,23 +299,23 @@ class RodReactions(_Reactions):
 def elements_at(host, dofs: SupportDofs, k: np.ndarray, column: np.ndarray) -> tuple:
     """Return (entry, element, column, local node) of all elements at nodes or angles k of columns of a rod group."""
     kind, count, entry = host.kind, host.count[column], np.arange(len(k))
-    found = []
+    entries = []
     for offset in range(kind.span + 1):
         some = ~dofs.is_angle | (offset < kind.span)
         element, local = k - offset, offset + np.where(dofs.is_angle, kind.span + 1, 0)
         if kind.closed:
             element = element % count
         some &= (element >= 0) & (element < count - (0 if kind.closed else 1))
-        found.append([values[some] for values in (entry, element, column, local)])
-    return tuple(np.concatenate(values) for values in zip(*found, strict=True))
+        entries.append([values[some] for values in (entry, element, column, local)])
+    return tuple(np.concatenate(values) for values in zip(*entries, strict=True))
 
 
 def coupled_elements_at(host, dofs: SupportDofs, normals: NormalMoments) -> tuple:
     """Return the elements of the coupled system next to supports.
 
     Returns:
-        The elements of each set, numbered consecutively as columns; entry, column and local node of all pairs of a fixed place and an
-        element; and the columns of `normals`.
+        Elements of each set, in consecutive columns. Entry, column and local node of all pairs of a fixed dof block and an element.
+        Columns of `normals`.
     """
     listed, pairs, columns, first = [], [np.zeros((3, 0), int)], np.zeros(len(normals), int), 0
     for index, element_set in enumerate(host.sets):
@@ -364,7 +364,7 @@ class CoupledReactions(_Reactions):
             self.kernels += self._obstacles.kernels
 
     def follow(self, step) -> None:
-        """Allocate what a `CoupledStep` needs, before a capture."""
+        """Allocate the arrays for a `CoupledStep`, before a capture."""
         newton, host = step.newton, self.part.host
         self._react = support_forces.coupled_reaction_kernel(
             self._real, newton.linear, host.drag is not None, newton.contact is not None
@@ -374,7 +374,7 @@ class CoupledReactions(_Reactions):
             self._obstacles.follow(newton.contact.terms)
 
     def evaluate(self, state, q: wp.array, rate: wp.array) -> wp.array:
-        """Evaluate the elements at supports at dofs q; return their forces by local node; capturable."""
+        """Evaluate the elements at supports at dofs q, and return their forces by local node; capturable."""
         total = self._entries.elements
         for index, listed, first, kernel in self._sets:
             inputs = [self.part.elements(state, index, q, rate), listed, 1, first, total]
@@ -463,10 +463,10 @@ class _Obstacles:
         self._inputs = [pairs, self._owner, self._integers(of_object), len(of_object), self._length, self._origin]
 
     def _pairs(self, pair_set):
-        struct, found = pairs_type(self._real)(), pair_set.found
+        struct, candidates = pairs_type(self._real)(), pair_set.found
         struct.count, struct.starts, struct.partners = pair_set.count, pair_set.starts, pair_set.partners
         struct.nodes, struct.used, struct.gradient = pair_set.factor.nodes, pair_set.factor.used, pair_set.gradient
-        struct.primitives, struct.first = found.first.count, found.kind.first
+        struct.primitives, struct.first = candidates.first.count, candidates.kind.first
         if hasattr(pair_set, "lagged"):
             struct.spinning, struct.arm = pair_set.lagged.spinning, pair_set.lagged.arm
         return struct
@@ -478,7 +478,7 @@ class _Obstacles:
 
 
 class _References:
-    """Reference points of the supports whose first node lies in a rod group or in the coupled system."""
+    """Reference points of supports, by the subsystem of their first node."""
 
     def __init__(self, model, part, dofs: SupportDofs, supports: np.ndarray, origin: wp.array):
         self._part, self._model, self._origin, device = part, model, origin, model.wp_device
