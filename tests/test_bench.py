@@ -135,6 +135,21 @@ def test_coupled_rods_and_sheets_are_timed(tmp_path, tool, options, rows):
 
 
 @pytest.mark.slow
+def test_iterations_of_the_multilevel_preconditioner_are_counted(tmp_path):
+    command = [sys.executable, str(ROOT / "tools/bench_sheets.py"), "--iterations", "--quick", "--device", "cpu"]
+    command += ["--bending", "hinge", "--shapes", "flat", "--linear", "multilevel", "--out", str(tmp_path)]
+    subprocess.run(command, capture_output=True, text=True, check=True)
+    with open(tmp_path / "iterations_cpu.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["cells"] for row in rows] == ["16", "32", "16", "32"]
+    for row in rows:
+        assert float(row["pcg_a_step"]) > 0.0
+        assert row["outcomes"] == "12 converged"
+        hats = [int(count) for count in row["hats"].split()]
+        assert len(hats) > 1 and hats == sorted(hats, reverse=True)
+
+
+@pytest.mark.slow
 def test_builds_are_timed(tmp_path):
     command = [sys.executable, str(ROOT / "tools/bench_rods.py"), "--build", "--quick", "--out", str(tmp_path)]
     subprocess.run(command, capture_output=True, text=True, check=True)

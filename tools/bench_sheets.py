@@ -100,7 +100,7 @@ def count_iterations(shape: str, cells: int, bending: str, rate: int, device, li
         "pcg_a_step": (statistics["pcg_iterations"] - before["pcg_iterations"]) / 6,
         "newton_mean": statistics["newton_iterations"]["mean"],
         "outcomes": ", ".join(f"{count} {name}" for name, count in statistics["outcomes"].items()),
-        "hats": " ".join(str(level.hats) for level in levels.levels) if levels else "",
+        "hats": " ".join(map(str, levels.counts)) if levels else "",
     }
 
 
