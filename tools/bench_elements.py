@@ -119,7 +119,9 @@ def registers() -> list[dict]:
         of_terms = [f" {term.name}" for term in terms]
         named = list(zip(of_terms if len(kernels) == len(terms) > 1 else [""], kernels, strict=True))
         if precision == "float64":
-            named += zip([f"{term}, adjoint" for term in of_terms], reverse, strict=True)
+            reverse = reverse if isinstance(reverse, list) else [reverse]
+            each = of_terms if len(reverse) == len(of_terms) else [""]
+            named += zip([f"{term}, adjoint" for term in each], reverse, strict=True)
         for name, kernel in named:
             with tempfile.TemporaryDirectory() as folder:
                 wp.compile_aot_module(kernel.module, arch=90, module_dir=folder, use_ptx=False)
@@ -183,12 +185,16 @@ def main() -> int:
         "machine": machine(""),
     }
     if chosen.only != "times":
-        before, after = work(chosen.base, "registers"), work(None, "registers")
+        each = {"before": work(chosen.base, "registers"), "after": work(None, "registers")}
+        by_kernel = {when: {(row["kernel"], row["precision"]): row for row in rows} for when, rows in each.items()}
         rows = [
-            {"kernel": new["kernel"], "precision": new["precision"]}
-            | {f"{name}_{when}": row[name] for name in ("registers", "stack", "code_kb") for when, row in pair.items()}
-            for old, new in zip(before, after, strict=True)
-            for pair in ({"before": old, "after": new},)
+            {"kernel": kernel, "precision": precision}
+            | {
+                f"{name}_{when}": found.get((kernel, precision), {}).get(name, "")
+                for name in ("registers", "stack", "code_kb")
+                for when, found in by_kernel.items()
+            }
+            for kernel, precision in dict.fromkeys([*by_kernel["before"], *by_kernel["after"]])
         ]
         write_table(chosen.out / "elements_registers", rows, about)
         print(table(rows))
