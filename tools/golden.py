@@ -130,6 +130,27 @@ def magnet() -> ddg.Scene:
     return scene
 
 
+def rods_in_fluid(joined: bool = False) -> ddg.Scene:
+    """Return rods with anisotropic drag in a flow, without mass or with a follower couple; `joined`: as a coupled system."""
+    scene = ddg.Scene(gravity=DOWN, flow=lambda t: (0.1 + t, 0.2, 0.0))
+    rods = cantilevers(scene, material=SOFT)
+    light = scene.add_rod(
+        line(9) + [1.0, 0.0, 0.0], section=SECTION, material=ddg.Material(young=1e6, poisson=0.3, density=0.0)
+    )
+    scene.fix(light, [8])
+    scene.add_couple(int(rods[1]), -1, (0.0, 1e-3, 2e-3))
+    scene.drag([int(rods[0]), light], tangential=0.1, normal=0.2, rotational=1e-4, nodes=0.01)
+    scene.drag(int(rods[1]), ddg.Granular(lateral=0.3, friction=0.1, leading=0.05, speed=0.05))
+    if joined:
+        scene.join([(int(rods[0]), -1), (light, 0)])
+    return scene
+
+
+def joined_in_fluid() -> ddg.Scene:
+    """Rods of a coupled system with drag."""
+    return rods_in_fluid(True)
+
+
 def strands(scene: ddg.Scene, joined: bool = False) -> ddg.Scene:
     """Add curly hair, whose axial forces are unknowns in mixed precision; `joined`: with its roots joined to clamped stubs."""
     kind = {"section": ddg.Circle(40e-6), "material": HAIR}
@@ -170,6 +191,11 @@ CASES: dict[str, tuple[Callable[[], ddg.Scene], str, float, dict]] = {
     "sheet": (sheet, "float64", 0.005, {}),
     "contact": (contact, "float64", 0.005, {}),
     "magnet": (magnet, "float64", 0.01, {}),
+    "drag": (rods_in_fluid, "float64", 0.01, {}),
+    "drag_mixed": (rods_in_fluid, "mixed", 0.01, {}),
+    "drag_midpoint": (rods_in_fluid, "float64", 0.002, {"scheme": "implicit_midpoint"}),
+    "drag_joined": (joined_in_fluid, "float64", 0.01, {}),
+    "drag_joined_midpoint": (joined_in_fluid, "float64", 0.002, {"scheme": "implicit_midpoint"}),
     "tensions": (tensions, "mixed", 1.0 / 60.0, {}),
     "tensions_joined": (tensions_joined, "mixed", 1.0 / 60.0, {}),
 }
@@ -183,6 +209,9 @@ GRADIENTS = {
     "grad_closed": ("closed rod", "implicit_euler"),
     "grad_joined": ("rods joined rigidly", "implicit_midpoint"),
     "grad_shell": ("shell, midedge", "implicit_euler"),
+    "grad_drag": ("rod with drag", "implicit_midpoint"),
+    "grad_drag_joined": ("joined rods with drag", "implicit_euler"),
+    "grad_couple": ("rod under a couple", "implicit_euler"),
     "grad_contact": ("rods in contact", "implicit_euler"),
     "grad_static": ("rod", "statics"),
     "grad_static_net": ("rods joined rigidly", "statics"),
