@@ -153,11 +153,11 @@ def resistance(part, stepper, q, q0) -> np.ndarray:
         x = q.reshape(len(mass), part.block)
         for node, each in enumerate(mass):
             dim = part.group.kind.dim
-            drag[node, :dim] = each["resistance"] @ (x[node, :dim] - each["carried"])
+            drag[node, :dim] = each["stiffness"] @ (x[node, :dim] - each["reference"])
             drag[node, dim:] = each["spin"] * (x - q0.reshape(x.shape))[node, dim:]
         return drag.ravel()
     x = q.reshape(-1, 3)
-    return np.concatenate([each["resistance"] @ (x[i] - each["carried"]) for i, each in enumerate(mass.ravel())])
+    return np.concatenate([each["stiffness"] @ (x[i] - each["reference"]) for i, each in enumerate(mass.ravel())])
 
 
 def run(scene, device, scheme=EULER, steps=STEPS, dt=DT, precision="float64", **options):

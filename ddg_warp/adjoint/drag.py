@@ -6,9 +6,10 @@ from scipy import sparse
 
 from ddg_warp import device_arrays
 from ddg_warp.kernels.adjoint.drag import coupled_kernels, rod_kernels
+from ddg_warp.kernels.core.inertia import block_inertia
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.elements import rod_layout
-from ddg_warp.kernels.forces.drag import ROWS, block_inertia
+from ddg_warp.kernels.forces.drag import ROWS
 from ddg_warp.solve.forces.drag import CoupledDrag, RodGroupDrag
 from ddg_warp.solve.linear.sparse_system import lists
 
@@ -50,7 +51,7 @@ class RodDragAdjoint:
         self.drag.resist(before, tangents, *self._inertia, self._islands)
         inertia = device_arrays.download(self._inertia[0]).T.ravel()
         blocks = np.zeros((len(inertia), kind.block, kind.block))
-        blocks[:, : kind.dim, : kind.dim] = inertia["resistance"].reshape(-1, kind.dim, kind.dim)
+        blocks[:, : kind.dim, : kind.dim] = inertia["stiffness"].reshape(-1, kind.dim, kind.dim)
         if kind.twist:
             blocks[:, kind.dim, kind.dim] = inertia["spin"]
         return sparse.block_diag(blocks, format="csc")
@@ -135,7 +136,7 @@ class CoupledDragAdjoint:
     @property
     def matrix(self) -> sparse.csc_matrix:
         """Drag matrix of `inertia`, in dof blocks of space components."""
-        return sparse.block_diag(self.inertia.numpy()["resistance"].reshape(-1, 3, 3), format="csc")
+        return sparse.block_diag(self.inertia.numpy()["stiffness"].reshape(-1, 3, 3), format="csc")
 
     def vjp(
         self,

@@ -50,7 +50,7 @@ class RodPredictor:
     def of(cls, model, group, motion, scheme: str | None) -> "RodPredictor | None":
         """Return the predictor of a scheme; None if solves lag nothing at the predicted configuration."""
         kind, midpoint = group.kind, scheme == "implicit_midpoint"
-        needed = scheme and (group.host.followers or (midpoint and (kind.twist or kind.drag)))
+        needed = scheme and (group.host.followers or (midpoint and (kind.twist or kind.quadratic)))
         return cls(model, group, motion, midpoint) if needed else None
 
     @property

@@ -111,7 +111,7 @@ class RodStepAdjoint:
         self.solve = RodLinearSolve(model, group)
         self.supports = Supports(model, group, midpoint) if (scheme or posed) and group.host.moves else None
         motion = self.supports.motion if self.supports else None
-        self.drag = RodDragAdjoint(model, group, midpoint) if kind.drag and scheme else None
+        self.drag = RodDragAdjoint(model, group, midpoint) if kind.quadratic and scheme else None
         self.followers = Followers(model, group, midpoint) if group.host.followers and scheme else None
         self.predictor = RodPredictor.of(model, group, motion, scheme)
         terms = range(len(kind.terms))
@@ -127,7 +127,7 @@ class RodStepAdjoint:
         self._vjp = elements.pull_kernel(storage, real, False, viscous, not self._complete)
         self._windows = elements.window_kernel(storage, real) if self._complete else None
         self._end, self._start = rod_step_kernels(kind, real, midpoint, self._complete)
-        *_, self._update = time_step.step_kernels(kind.nodes, real, midpoint, kind.drag)
+        *_, self._update = time_step.step_kernels(kind.nodes, real, midpoint, kind.quadratic)
         leaves = np.tile(~group.host.fixed | _moved(group), (1, group.worlds))
         self._leaves = device_arrays.upload(leaves, wp.uint8, device)
         self._rate = wp.zeros(group.columns, dtype=real, device=device)

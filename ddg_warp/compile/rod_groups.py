@@ -165,7 +165,7 @@ def _join(parts: list[UniformRods], ghosts: GhostNodes, laws: drag.Laws) -> RodG
     n, total = int(count.max()), len(rods)
     x, frame = np.zeros((n, total, kind.dim)), np.zeros((kind.lagged_rows, n, total))
     mass, rotary, length, parameters, start = np.zeros((n, total)), np.zeros((n, total)), np.zeros(total), [], 0
-    coefficients = np.zeros((DRAG_ROWS, n, total)) if kind.drag else None
+    coefficients = np.zeros((DRAG_ROWS, n, total)) if kind.quadratic else None
     for run in (run for part in parts for run in part.runs):
         piece, columns = piece_of(run, ghosts, laws), slice(start, start + len(run.rods))
         edges = piece.rotary.shape[1]
@@ -174,7 +174,7 @@ def _join(parts: list[UniformRods], ghosts: GhostNodes, laws: drag.Laws) -> RodG
         if kind.twist:
             frame[0:3, :edges, columns], frame[3:6, :edges, columns] = piece.director.T, piece.tangent.T
             frame[6, : piece.reference_twist.shape[1], columns] = piece.reference_twist.T
-        if kind.drag:
+        if kind.quadratic:
             coefficients[:, :edges, columns] = piece.drag.T
         length[columns], start = piece.length, columns.stop
         parameters.append((len(run.rods), piece.parameters))

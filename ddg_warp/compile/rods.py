@@ -105,7 +105,7 @@ def _kind(dimension: int, batch: RodBatch, dragged: bool) -> RodKind:
     viscous = bool(np.any(np.asarray(batch.section.viscosity) > 0.0))
     keys = [*(term_key(name, batch.by_angle) for name in names[:-1]), names[-1]]  # the last is stretch
     terms = tuple(REGISTRY[key].of(batch.laws).damped(viscous) for key in keys)
-    return RodKind(dimension, batch.twist, batch.closed, terms, drag=dragged)
+    return RodKind(dimension, batch.twist, batch.closed, terms, quadratic=dragged)
 
 
 def piece_of(part: UniformRods, outside: GhostNodes, laws: drag.Laws) -> RodArrays:
@@ -196,7 +196,7 @@ def piece_of(part: UniformRods, outside: GhostNodes, laws: drag.Laws) -> RodArra
         parameters,
         [on_edges(value) for value in (section.EI1, section.EI2, section.GJ)],
         laws.coefficients(rods, batch, on_edges(np.nan if section.radius is None else section.radius), rod_lengths)
-        if kind.drag
+        if kind.quadratic
         else None,
     )
 

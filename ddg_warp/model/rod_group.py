@@ -47,7 +47,7 @@ class RodGroup:
         self.mass = put(host.mass, real)
         self.rotary = put(host.rotary, real)
         self.has_custom_mass = False
-        self.drag = put(host.drag, real) if kind.drag else None
+        self.drag = put(host.drag, real) if kind.quadratic else None
         self.fixed = put(host.fixed, wp.uint8)
         self.anchor = put(_last_anchor(host), int)
         load, moment = _constant_loads(host) if host.loaded else (np.zeros((1, 1, kind.dim)), np.zeros((1, 1)))
@@ -132,7 +132,7 @@ class RodGroup:
     def _find_stiffnesses(self, s: float) -> tuple[np.ndarray, ...]:
         host = self.host
         mass, length = host.mass.sum(0) / host.count, host.length
-        if self.kind.drag:
+        if self.kind.quadratic:
             mass = mass + s * drag.least(host.drag.T) * host.length / host.count
             length = np.where(host.fixed.any(0), length, np.inf)  # over long steps only drag acts on a free rod
         mass, length = (np.tile(values, self.worlds) for values in (mass, length))

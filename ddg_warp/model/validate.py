@@ -60,7 +60,7 @@ def require_mass(model) -> None:
         k = np.arange(group.nodes)[:, None]
         nodes = (k >= host.first) & (k < host.first + host.own)
         massless = (host.mass <= 0.0) & ((host.fixed & positions) != positions) & nodes
-        if kind.drag:
+        if kind.quadratic:
             first, last = drag.holds(host.drag)  # of edges; the last node of an open rod begins none
             massless &= ~(first | np.roll(last, 1, axis=0))
         if massless.any():

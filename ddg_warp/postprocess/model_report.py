@@ -41,7 +41,7 @@ def report(model) -> str:
             present.add(term.name)
             elements = int((host.count - (0 if kind.closed else term.measure.span)).sum()) * model.worlds
             lines.append(f"  {term.name}: {elements} elements, {term.measure.name} x {term.density.name}")
-        if kind.drag:
+        if kind.quadratic:
             lines.append("  drag, implicit")
         solver = CLOSED if kind.closed else SOLVERS[automatic(group)]
         lines.append(f"  solver: {solver}, linear algebra in {model.types.linear.__name__}")

@@ -100,11 +100,11 @@ def drag(model, state) -> Drag:
     for group, data in zip(model.groups, state.groups, strict=True):
         v, omega = (device_arrays.download(array).astype(float) for array in (data.v, data.omega))
         force, moment = np.zeros_like(v), np.zeros_like(omega)
-        if group.kind.drag:
+        if group.kind.quadratic:
             resisted = RodGroupDrag(model, group)
             v, omega = resisted.rates(data, state.lead)
             inertia, u = resisted.at(data, state.time)
-            force = np.einsum("krij,krj->kri", inertia["resistance"], u - v)
+            force = np.einsum("krij,krj->kri", inertia["stiffness"], u - v)
             moment = -inertia["spin"] * omega if group.kind.twist else moment
         work = (force * v).sum((0, 2)) + (moment * omega).sum(0)
         power += work.reshape(group.worlds, group.rods).sum(1)
@@ -117,7 +117,7 @@ def drag(model, state) -> Drag:
             resisted = CoupledDrag(model)
             v = resisted.rates(state.coupled, state.lead)
             inertia, u = resisted.at(state.coupled, state.time)
-            force = np.einsum("wkij,wkj->wki", inertia["resistance"], u - v)
+            force = np.einsum("wkij,wkj->wki", inertia["stiffness"], u - v)
         power += (force * v).sum((1, 2))
         _, places = model.order.coupled_rows
         turns = force[:, model.coupled.angle_start :, 0]

@@ -196,7 +196,7 @@ def _inertia(model) -> Iterator[_Part]:
 def _drag(model, name: str) -> Iterator[_Part]:
     row, granular = COEFFICIENTS[name], name.partition(".")[2] in GRANULAR
     for index, group in enumerate(model.groups):
-        if group.kind.drag and (group.kind.twist or row != drag.ROTATIONAL):
+        if group.kind.quadratic and (group.kind.twist or row != drag.ROTATIONAL):
             k, column, rows = model.order.edge_places(group)
             places, usual = k * group.rods + column, group.host.drag[row]
             chosen = ((group.host.drag[drag.SPEED].ravel()[places] > 0.0) == granular) | (row in BODIES.values())
@@ -216,7 +216,7 @@ def _drag(model, name: str) -> Iterator[_Part]:
         coupled, (_, angles, coefficients) = model.coupled, model.coupled.host.drag
         places, rows, first_edge = [np.zeros(0, int)], [np.zeros(0, int)], 0
         for rod in coupled.host.rods:
-            if rod.piece.kind.drag:
+            if rod.piece.kind.quadratic:
                 local_edges = np.arange(len(rod.nodes) - (0 if rod.piece.kind.closed else 1))
                 places.append(first_edge + rod.first + local_edges)
                 rows.append(model.order.edge_starts[rod.rod] + local_edges)

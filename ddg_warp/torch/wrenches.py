@@ -456,7 +456,7 @@ class _Rods(_Part):
     @property
     def resisted(self) -> bool:
         """True with drag."""
-        return self.part.kind.drag
+        return self.part.kind.quadratic
 
     def _edges(self) -> tuple:
         """Return edges with drag, see `_Part`."""

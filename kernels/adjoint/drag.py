@@ -9,9 +9,10 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.core.dof_map import row_functions
+from ddg_warp.kernels.core.inertia import block_inertia
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions
-from ddg_warp.kernels.forces.drag import FIRST, LAST, ROTATIONAL, ROWS, block_inertia, edge_function
+from ddg_warp.kernels.forces.drag import FIRST, LAST, ROTATIONAL, ROWS, edge_function
 from ddg_warp.kernels.residual.rod_residual import node_functions
 
 
@@ -245,7 +246,7 @@ def coupled_kernels(real, midpoint: bool):
         i = wp.tid()
         world = i / blocks
         node = inertia[world, i - world * blocks]
-        back = node.resistance * w[i]
+        back = node.stiffness * w[i]
         fixed_out[i] = fixed_out[i] - back
         q_out[i] = q_out[i] + back
         rate_out[i] = rate_out[i] - wp.dot(back, q[i] - q0[i]) / rate

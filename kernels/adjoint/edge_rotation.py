@@ -1,7 +1,7 @@
 """Vector-Jacobian product of predictors with edge rotations; see `kernels.newton.edge_rotation`.
 
-It is needed if a solve lags quantities of its predictor: follower loads and, with the midpoint rule, frames and drag. `rod_predictor`
-and `coupled_predictor` apply it to uncoupled rods and to the coupled system.
+It is needed if a solve lags quantities of its predictor: follower loads and, with the midpoint rule, frames and quadratic forces.
+`rod_predictor` and `coupled_predictor` apply it to uncoupled rods and to the coupled system.
 """
 
 from functools import cache

@@ -7,10 +7,10 @@ import warp as wp
 from ddg_warp.kernels.adjoint.rod_elements import frame_function, gathered_function, lagged_function
 from ddg_warp.kernels.adjoint.time_step import step_functions
 from ddg_warp.kernels.core.dof_map import row_functions
+from ddg_warp.kernels.core.inertia import block_inertia
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.core.nodes import dof_functions, mass_functions, state_type
 from ddg_warp.kernels.elements.rod_layout import RodKind
-from ddg_warp.kernels.forces.drag import block_inertia
 from ddg_warp.kernels.newton.edge_rotation import loose_function
 from ddg_warp.kernels.residual.rod_residual import node_functions
 
@@ -29,7 +29,7 @@ def rod_step_kernels(kind: RodKind, real, midpoint: bool, complete: bool):
     Inertia, free_components = block_inertia(real), loose_function(block, real)
     (dofs, store), (masses, store_masses) = dof_functions(nodes, real), mass_functions(nodes, real)
     row_of, store_row = row_functions(block, real)
-    solution_of, inertia_of, start_of = step_functions(nodes, real, midpoint, kind.drag)
+    solution_of, inertia_of, start_of = step_functions(nodes, real, midpoint, kind.quadratic)
     gathered, (previous, _) = gathered_function(kind, real), node_functions(kind, real)
     frame_vjp = frame_function(kind, real, True) if twist else None
     add_lagged = lagged_function(kind, real) if twist else None

@@ -10,17 +10,17 @@ import warp as wp
 
 from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.dof_map import column_of, point_functions, row_functions
+from ddg_warp.kernels.core.inertia import block_inertia
 from ddg_warp.kernels.core.islands import RETRIES, STATUS, SUBSTEP_FRACTION
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.core.nodes import NodeStorage, dof_functions, mass_functions, state_type
 from ddg_warp.kernels.elements.variation import angle_function
-from ddg_warp.kernels.forces.drag import block_inertia
 from ddg_warp.kernels.forces.prescribed_motion import functions, reached_function
 from ddg_warp.kernels.newton.edge_rotation import loose_function
 
 
 @cache
-def step_functions(nodes: NodeStorage, real, midpoint: bool, drag: bool):
+def step_functions(nodes: NodeStorage, real, midpoint: bool, quadratic: bool):
     """Build the device functions of the end update and of inertia, for a node.
 
     `solution_of(...)`: gradient by the dofs of the solve, given gradients by the end of the step and `more`.
@@ -28,11 +28,11 @@ def step_functions(nodes: NodeStorage, real, midpoint: bool, drag: bool):
     adjoint w of the solve.
     `start_of(...) -> (x, v, rate)`: these gradients with the contributions of the end update and of dofs that stay at the start.
 
-    `more`: gradients by the dofs of the end through its frames and strains. `resisted`: inertia and drag of the coupled system. The
+    `more`: gradients by the dofs of the end through its frames and strains. `resisted`: the inertia of the coupled system. The
     first `positions` nodes have weight.
     """
     coupled, dim, block = nodes.coupled, nodes.dim, nodes.block
-    settles = drag and midpoint  # then velocities of massless dofs are means over the step: `settle` of `forces.drag`
+    settles = quadratic and midpoint  # then velocities of massless dofs are means over the step
     V, B, State = wp.types.vector(dim, real), wp.types.vector(block, real), state_type(nodes, real)
     (dofs, _), free_components = dof_functions(nodes, real), loose_function(block, real)
     end_weight = real(2.0 if midpoint else 1.0)  # derivative of the end by the solution
@@ -47,7 +47,7 @@ def step_functions(nodes: NodeStorage, real, midpoint: bool, drag: bool):
             if wp.static(settles):
                 settled = m[d] <= real(0.0)
                 if wp.static(coupled):
-                    settled = settled and resisted[k, island].resistance[d, d] > real(0.0)
+                    settled = settled and resisted[k, island].stiffness[d, d] > real(0.0)
                 if settled:
                     result[d] = real(1.0)
         return result
@@ -122,7 +122,7 @@ def step_functions(nodes: NodeStorage, real, midpoint: bool, drag: bool):
 
 
 @cache
-def step_kernels(nodes: NodeStorage, real, midpoint: bool, drag: bool):
+def step_kernels(nodes: NodeStorage, real, midpoint: bool, quadratic: bool):
     """Build the kernels of the end update and of inertia; see `step_functions`.
 
     `solution`: write gradients by the dofs of the solve, given gradients by the end of the step.
@@ -138,7 +138,7 @@ def step_kernels(nodes: NodeStorage, real, midpoint: bool, drag: bool):
     items, _ = nodes.thread_functions
     (dofs, store), (masses, store_masses) = dof_functions(nodes, real), mass_functions(nodes, real)
     row_of, store_row = row_functions(block, real)
-    solution_of, inertia_of, start_of = step_functions(nodes, real, midpoint, drag)
+    solution_of, inertia_of, start_of = step_functions(nodes, real, midpoint, quadratic)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def solution(

@@ -93,7 +93,7 @@ def _laws(density: Density, real, n: int):
         return curvature_of(rest(p), law_parameters(p))
 
     @wp.func
-    def drag(e: E, p: P):
+    def viscous_stress(e: E, p: P):
         if wp.static(is_coupled):
             return viscous(p) * (e - before(p)) * ratio(p)
         else:
@@ -101,11 +101,11 @@ def _laws(density: Density, real, n: int):
 
     @wp.func
     def energy(e: E, p: P):
-        return energy_of(e, law_parameters(p)) + real(0.5) * wp.dot(drag(e, p), e - before(p))
+        return energy_of(e, law_parameters(p)) + real(0.5) * wp.dot(viscous_stress(e, p), e - before(p))
 
     @wp.func
     def slope(e: E, p: P):
-        return slope_of(e, law_parameters(p)) + drag(e, p)
+        return slope_of(e, law_parameters(p)) + viscous_stress(e, p)
 
     @wp.func
     def curvature(e: E, p: P):

@@ -14,6 +14,7 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.core.inertia import node_inertia
 from ddg_warp.kernels.core.launch import until_function
 from ddg_warp.kernels.core.nodes import NodeStorage
 from ddg_warp.kernels.elements.element_path import ElementStorage, TermAccess, measure_functions
@@ -32,12 +33,12 @@ class RodKind:
     terms: tuple[Term, ...]
     serial: bool = False  # True if a thread takes all nodes of its rod; see `until_function`
     rod_major: bool = False  # True if memory holds rod after rod, as on the CPU; see `device_arrays.allocate`
-    drag: bool = False  # True with drag; see `kernels.forces.drag`
+    quadratic: bool = False  # True if nodes have a quadratic potential; see `kernels.core.inertia`
 
     @property
     def key(self) -> tuple:
         """Sort key of kinds."""
-        return self.dim, self.twist, self.closed, self.drag, [term.key for term in self.terms]
+        return self.dim, self.twist, self.closed, self.quadratic, [term.key for term in self.terms]
 
     @property
     def nodes(self) -> NodeStorage:
@@ -128,27 +129,8 @@ class RodKind:
 
 
 def inertia_type(kind: RodKind, real):
-    """Return the type of a node's inertia: its mass [kg]; with drag, a `drag_structure`."""
-    return drag_structure(kind.dim, real) if kind.drag else real
-
-
-@cache
-def drag_structure(dim: int, real):
-    """Return the struct of a node's mass and drag over a solve of length s.
-
-    One struct serves all kinds, so that Warp uses one kernel for equal ones. `resistance`: D / s [N/m]. `carried`: position that the
-    fluid alone would carry the node to. `spin`: resistance to the spin of the edge that starts there, over s [N m].
-    """
-    V, M = wp.types.vector(dim, real), wp.types.matrix((dim, dim), real)
-
-    @wp.struct
-    class NodeInertia:
-        mass: real
-        resistance: M
-        carried: V
-        spin: real
-
-    return NodeInertia
+    """Return the type of a node's inertia: its mass [kg], or a `node_inertia` with a quadratic potential."""
+    return node_inertia(kind.dim, real) if kind.quadratic else real
 
 
 @cache

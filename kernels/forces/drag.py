@@ -24,6 +24,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.core import outcome
+from ddg_warp.kernels.core.inertia import block_inertia
 from ddg_warp.kernels.core.islands import INERTIA_COEFFICIENT, INVERSE_STEP, LOAD_SCALE, STATUS, STEP_PROGRESS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
 from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions, inertia_type
@@ -132,10 +133,10 @@ def rod_kernels(kind: RodKind, real):
                 D += of_edge(tangents, v0, coefficients, u, b, n, r) + one * coefficients[wp.static(LAST), b, r]
             node = Inertia()
             node.mass = mass[k, r]
-            node.resistance = D * rate
-            node.carried = x0[k, r] + u * s
+            node.stiffness = D * rate
+            node.reference = x0[k, r] + u * s
             moved = wp.length(x[k, r] - x0[k, r]) + wp.length(u) * s
-            wp.atomic_max(scalars, LOAD_SCALE, r, real(n) * moved * wp.max(wp.get_diag(node.resistance)))
+            wp.atomic_max(scalars, LOAD_SCALE, r, real(n) * moved * wp.max(wp.get_diag(node.stiffness)))
             if wp.static(twist):
                 spin = real(0.0)
                 if wp.static(closed) or k < n - 1:
@@ -202,26 +203,6 @@ def rod_kernels(kind: RodKind, real):
 
 
 @cache
-def block_inertia(real):
-    """Return the struct of inertia and drag of a dof block: `ddg_warp.kernels.elements.rod_layout.inertia_type` with a mass per dof."""
-    V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
-
-    @wp.struct
-    class BlockInertia:
-        mass: V
-        resistance: M
-        carried: V
-
-    return BlockInertia
-
-
-@cache
-def mass_type(real, drag: bool):
-    """Return the array type of masses of dof blocks (worlds, blocks); with drag, of inertia and drag."""
-    return wp.array2d(dtype=block_inertia(real) if drag else wp.types.vector(3, real))
-
-
-@cache
 def coupled_kernels(real):
     """Build the kernels of drag on the coupled system.
 
@@ -282,12 +263,12 @@ def coupled_kernels(real):
         rate = scalars[INVERSE_STEP, w]
         block = Inertia()
         block.mass = mass[w, k]
-        block.resistance = D * rate
-        block.carried = q0[i] + u / rate
+        block.stiffness = D * rate
+        block.reference = q0[i] + u / rate
         inertia_out[w, k] = block
         if k < nodes and load[w] == real(0.0):
             moved = wp.length(q[i] - q0[i]) + wp.length(u) / rate
-            wp.atomic_max(scalars, LOAD_SCALE, w, real(nodes) * moved * wp.max(wp.get_diag(block.resistance)))
+            wp.atomic_max(scalars, LOAD_SCALE, w, real(nodes) * moved * wp.max(wp.get_diag(block.stiffness)))
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def settle(
@@ -313,7 +294,7 @@ def coupled_kernels(real):
         moved = wp.length_sq(v0[i]) > real(0.0)
         a = V()
         for d in range(3):
-            if block.mass[d] <= real(0.0) and block.resistance[d, d] > real(0.0):
+            if block.mass[d] <= real(0.0) and block.stiffness[d, d] > real(0.0):
                 v[d] = mean[d]
                 if moved:
                     a[d] = change[d]

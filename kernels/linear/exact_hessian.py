@@ -4,9 +4,9 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.core.inertia import mass_type
 from ddg_warp.kernels.core.islands import INERTIA_COEFFICIENT, NEEDS_DIRECTION
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
-from ddg_warp.kernels.forces.drag import mass_type
 from ddg_warp.kernels.linear.sliced_ell import inertia_function
 
 FIRST, SIGN, COUNT = range(
@@ -15,14 +15,14 @@ FIRST, SIGN, COUNT = range(
 
 
 @cache
-def exact_kernels(real, linear, drag: bool, serial: bool):
+def exact_kernels(real, linear, quadratic: bool, serial: bool):
     """Build the kernels of the exact Hessian.
 
-    `begin`: write inertia and drag.
+    `begin`: write the inertia.
     `add`: add the Hessians of one element set.
     """
-    M, Mass, until = wp.types.matrix((3, 3), linear), mass_type(real, drag), until_function(serial)
-    inertia_of = inertia_function(real, linear, drag)
+    M, Mass, until = wp.types.matrix((3, 3), linear), mass_type(real, quadratic), until_function(serial)
+    inertia_of = inertia_function(real, linear, quadratic)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def begin(

@@ -8,10 +8,10 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.core.inertia import mass_type
 from ddg_warp.kernels.core.islands import DROP_COMPRESSION, INERTIA_COEFFICIENT, ITERATION
 from ddg_warp.kernels.core.launch import first_of
 from ddg_warp.kernels.elements.coupled_element import part_function
-from ddg_warp.kernels.forces.drag import mass_type
 from ddg_warp.kernels.linear.rod_dof_map import edge_behind_function, path_node_dofs, path_node_functions
 from ddg_warp.kernels.linear.sliced_ell import second_function
 from ddg_warp.kernels.residual.coupled_residual_along_rods import along_type
@@ -156,7 +156,7 @@ def blocks_function(
     real,
     linear,
     exact_from: tuple[int | None, ...],
-    drag: bool,
+    quadratic: bool,
     mixed_axial: bool = False,
 ):
     """Return the device function `blocks_at(...) -> (D, E, F)` of a path node; fixed dofs have rows of the identity.
@@ -169,7 +169,7 @@ def blocks_function(
     nb = path_node_dofs(twist, mixed_axial)
     parts = 1 + twist  # dof blocks of a path node: node, twist angle of the edge ahead
     B, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
-    Mass, Layout, Along = mass_type(real, drag), layout_type(), along_type(real, linear)
+    Mass, Layout, Along = mass_type(real, quadratic), layout_type(), along_type(real, linear)
     free_of, block_of = path_node_functions(twist, linear, mixed_axial)
     late_terms = tuple(first is not None for first in exact_from)
     add = sum_function(terms, twist, real, linear, late_terms, mixed_axial) if terms else None
@@ -188,7 +188,7 @@ def blocks_function(
         c: int,
         w: int,
     ):
-        """Return the blocks; inertia and drag are added for nodes and angles without a position in H.
+        """Return the blocks; inertia is added for nodes and angles without a position in H.
 
         Bits of `held` are dofs of a path node that are fixed or missing.
         """
@@ -206,18 +206,18 @@ def blocks_function(
                     if layout.diagonal[block] < 0:
                         for d in range(3):
                             if part == 0 or d == 0:
-                                if wp.static(drag):
+                                if wp.static(quadratic):
                                     inertia = mass[w, block].mass[d] * scalars[INERTIA_COEFFICIENT, w]
                                 else:
                                     inertia = mass[w, block][d] * scalars[INERTIA_COEFFICIENT, w]
                                 D[3 * part + d, 3 * part + d] = D[3 * part + d, 3 * part + d] + linear(inertia)
-                        if wp.static(drag):
-                            resistance = mass[w, block].resistance
+                        if wp.static(quadratic):
+                            stiffness = mass[w, block].stiffness
                             for i in range(3):
                                 for j in range(3):
                                     if part == 0 or i + j == 0:
                                         D[3 * part + i, 3 * part + j] = D[3 * part + i, 3 * part + j] + linear(
-                                            resistance[i, j]
+                                            stiffness[i, j]
                                         )
         n = layout.count[c]
         fixed_here = layout.held[k, c]

@@ -7,9 +7,9 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.core.inertia import mass_type
 from ddg_warp.kernels.core.islands import MAX_EDGE_STIFFNESS, NEEDS_DIRECTION
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, TWO_BLOCKS, first_of, until_function
-from ddg_warp.kernels.forces.drag import mass_type
 from ddg_warp.kernels.linear.rod_band_assembly import blocks_function, layout_type
 from ddg_warp.kernels.linear.rod_dof_map import edge_behind_function, path_node_dofs, value_function
 from ddg_warp.kernels.linear.rod_matrix import TILE, block_functions
@@ -54,7 +54,7 @@ def band_kernels(
     real,
     linear,
     exact_from: tuple[int | None, ...],
-    drag: bool,
+    quadratic: bool,
     serial: bool,
     mixed_axial: bool = False,
 ):
@@ -66,11 +66,16 @@ def band_kernels(
     """
     nb = path_node_dofs(twist, mixed_axial)
     H, B = wp.types.vector(3, linear), wp.types.vector(nb, linear)
-    Mass, Layout, Along, until = mass_type(real, drag), layout_type(), along_type(real, linear), until_function(serial)
+    Mass, Layout, Along, until = (
+        mass_type(real, quadratic),
+        layout_type(),
+        along_type(real, linear),
+        until_function(serial),
+    )
     load, store, _, _ = block_functions(nb, linear)
     along, back = times_functions(nb, linear)
     settle = settle_function(linear)
-    blocks_at = blocks_function(terms, twist, span, real, linear, exact_from, drag, mixed_axial)
+    blocks_at = blocks_function(terms, twist, span, real, linear, exact_from, quadratic, mixed_axial)
     value = value_function(twist, linear, mixed_axial)
 
     @wp.kernel(

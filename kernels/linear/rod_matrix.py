@@ -72,7 +72,7 @@ def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None):
     dim, nb, nb2, twist, span, closed = kind.dim, kind.block, kind.block**2, kind.twist, kind.span, kind.closed
     window, vertex_rows, edge_rows, tensions = kind.window, kind.vertex_strains, kind.edge_strains, kind.tensions
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
-    drag, Inertia = kind.drag, inertia_type(kind, real)
+    quadratic, Inertia = kind.quadratic, inertia_type(kind, real)
     edge_row, tension_row = vertex_rows * window, vertex_rows * window + edge_rows * dim
     previous, _ = node_functions(kind, real)
     along, *_ = gather_functions(kind, real)
@@ -186,12 +186,12 @@ def assemble_kernel(kind: RodKind, real, linear, exact_from: int | None = None):
                 E -= S
             if b >= 0:
                 D += edge_block(F, b, r)
-            if wp.static(drag):
-                resistance = mass[k, r].resistance
+            if wp.static(quadratic):
+                stiffness = mass[k, r].stiffness
                 for d in range(wp.static(dim)):
                     D[d, d] = D[d, d] + linear(c * mass[k, r].mass)
                     for i in range(wp.static(dim)):
-                        D[d, i] = D[d, i] + linear(resistance[d, i])
+                        D[d, i] = D[d, i] + linear(stiffness[d, i])
             else:
                 for d in range(wp.static(dim)):
                     D[d, d] = D[d, d] + linear(c * mass[k, r])

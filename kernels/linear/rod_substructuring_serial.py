@@ -8,9 +8,9 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.core.inertia import mass_type
 from ddg_warp.kernels.core.islands import NEEDS_DIRECTION
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, first_of
-from ddg_warp.kernels.forces.drag import mass_type
 from ddg_warp.kernels.linear import block_ldlt
 from ddg_warp.kernels.linear.rod_band_assembly import blocks_function, layout_type
 from ddg_warp.kernels.linear.rod_dof_map import value_function
@@ -27,7 +27,7 @@ def walk_kernel(
     real,
     linear,
     exact_from: tuple[int | None, ...],
-    drag: bool,
+    quadratic: bool,
     joined: bool,
 ):
     """Build the kernel that solves rod paths on the CPU.
@@ -38,8 +38,8 @@ def walk_kernel(
     """
     nb = 4 if twist else 3
     H, B, M = wp.types.vector(3, linear), wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
-    Mass, Layout, Along = mass_type(real, drag), layout_type(), along_type(real, linear)
-    blocks_at = blocks_function(terms, twist, span, real, linear, exact_from, drag)
+    Mass, Layout, Along = mass_type(real, quadratic), layout_type(), along_type(real, linear)
+    blocks_at = blocks_function(terms, twist, span, real, linear, exact_from, quadratic)
     value = value_function(twist, linear)
     load, store, vector, store_vector = block_functions(nb, linear)
     factor, lower, upper, lower_vector, upper_vector, congruence = block_ldlt.functions(nb, linear)

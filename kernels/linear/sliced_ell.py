@@ -9,10 +9,10 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.core.inertia import mass_type
 from ddg_warp.kernels.core.islands import DROP_COMPRESSION, INERTIA_COEFFICIENT, ITERATION, NEEDS_DIRECTION
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
 from ddg_warp.kernels.elements.coupled_element import factor_type, part_function
-from ddg_warp.kernels.forces.drag import mass_type
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.terms import Term
 
@@ -137,24 +137,24 @@ def sum_function(term: Term, linear, exact: bool, local: bool):
 
 
 @cache
-def inertia_function(real, linear, drag: bool):
-    """Return the device function `inertia_of(mass, coefficient, w, block)`: inertia and drag of a dof block in H."""
-    M, Mass = wp.types.matrix((3, 3), linear), mass_type(real, drag)
+def inertia_function(real, linear, quadratic: bool):
+    """Return the device function `inertia_of(mass, coefficient, w, block)`: the inertia of a dof block in H."""
+    M, Mass = wp.types.matrix((3, 3), linear), mass_type(real, quadratic)
 
     @wp.func
     def inertia_of(mass: Mass, coefficient: real, w: int, block: int):
         m = M()
-        if wp.static(drag):
+        if wp.static(quadratic):
             inertia = mass[w, block].mass * coefficient
         else:
             inertia = mass[w, block] * coefficient
         for d in range(3):
             m[d, d] = linear(inertia[d])
-        if wp.static(drag):
-            resistance = mass[w, block].resistance
+        if wp.static(quadratic):
+            stiffness = mass[w, block].stiffness
             for i in range(3):
                 for j in range(3):
-                    m[i, j] = m[i, j] + linear(resistance[i, j])
+                    m[i, j] = m[i, j] + linear(stiffness[i, j])
         return m
 
     return inertia_of
@@ -173,7 +173,7 @@ def assemble_kernel(
     begins: bool,
     exact_from: tuple[int | None, ...],
     local: tuple[bool, ...],
-    drag: bool,
+    quadratic: bool,
     angles: bool,
     serial: bool,
 ):
@@ -181,17 +181,17 @@ def assemble_kernel(
 
     `assemble`: write or update H with up to `SETS` element sets, one thread a position.
 
-    The kernel that `begins` adds inertia and drag; others add to H. `exact_from`: for each set, the first iteration with second
+    The kernel that `begins` adds the inertia; others add to H. `exact_from`: for each set, the first iteration with second
     derivatives, the same for all, or None without. `local`: layout of the set's factor. `angles`:
     True if some blocks are twist angles, see `product_functions`.
     """
-    M, Mass, until = wp.types.matrix((3, 3), linear), mass_type(real, drag), until_function(serial)
+    M, Mass, until = wp.types.matrix((3, 3), linear), mass_type(real, quadratic), until_function(serial)
     sums = tuple(
         sum_function(term, linear, first is not None, is_local)
         for term, first, is_local in zip(terms, exact_from, local, strict=True)
     )
     begin = next((first for first in exact_from if first is not None), 0)
-    inertia_of = inertia_function(real, linear, drag)
+    inertia_of = inertia_function(real, linear, quadratic)
     count = len(terms)
     last = count - 1
     Own0, Own1, Own2, Own3, Own4, Own5 = (contributions(linear, local[min(i, last)]) for i in range(SETS))

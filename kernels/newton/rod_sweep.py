@@ -109,7 +109,7 @@ def eliminate_function(kind: RodKind, real, linear, exact_from: int | None, mixe
     """
     Data = data_type(kind, real, linear)
     dim, nb, twist, span = kind.dim, kind.block, kind.twist, kind.span
-    window, nb2, drag = kind.window, kind.block**2, kind.drag
+    window, nb2, quadratic = kind.window, kind.block**2, kind.quadratic
     H, M = wp.types.vector(nb, linear), wp.types.matrix((nb, nb), linear)
     factor_block, lower, upper, lower_vector, upper_vector, congruence = block_ldlt.functions(nb, linear)
     angle, rows = nb - 1, kind.factor_rows + mixed_axial
@@ -187,7 +187,7 @@ def eliminate_function(kind: RodKind, real, linear, exact_from: int | None, mixe
         mask = data.fixed[k, r]
         node_mass = real(0.0)
         spin = real(0.0)
-        if wp.static(not drag):
+        if wp.static(not quadratic):
             node_mass = data.mass[k, r]
         if wp.static(twist):
             spin = data.rotary[k, r]
@@ -199,7 +199,7 @@ def eliminate_function(kind: RodKind, real, linear, exact_from: int | None, mixe
             mask_ahead = data.fixed[k_ahead, r]
             node_mass_ahead = real(0.0)
             spin_ahead = real(0.0)
-            if wp.static(not drag):
+            if wp.static(not quadratic):
                 node_mass_ahead = data.mass[k_ahead, r]
             if wp.static(twist):
                 spin_ahead = data.rotary[k_ahead, r]
@@ -251,12 +251,12 @@ def eliminate_function(kind: RodKind, real, linear, exact_from: int | None, mixe
                     Waa += T
                     Wab -= T
                     Wbb += T
-            if wp.static(drag):
+            if wp.static(quadratic):
                 inertia = linear(c * data.mass[k, r].mass)
-                resistance = data.mass[k, r].resistance
+                stiffness = data.mass[k, r].stiffness
                 for d in range(wp.static(dim)):
                     for i in range(wp.static(dim)):
-                        Waa[d, i] = Waa[d, i] + linear(resistance[d, i])
+                        Waa[d, i] = Waa[d, i] + linear(stiffness[d, i])
             else:
                 inertia = linear(c * node_mass)
             for d in range(wp.static(dim)):

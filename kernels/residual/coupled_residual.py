@@ -10,6 +10,7 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.core.inertia import mass_type
 from ddg_warp.kernels.core.islands import (
     BELOW_ROUNDING_FLOOR,
     DOUBTFUL,
@@ -20,7 +21,6 @@ from ddg_warp.kernels.core.islands import (
     STATUS,
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
-from ddg_warp.kernels.forces.drag import mass_type
 from ddg_warp.kernels.newton.line_search import ROUNDED, SETTLED
 
 
@@ -50,7 +50,7 @@ def meeting_type(real, linear):
 
 
 @cache
-def inputs_type(real, drag: bool):
+def inputs_type(real, quadratic: bool):
     """Return the struct of inputs of the residual but for elements.
 
     `push`, `pressed`: contact forces of blocks, and bounds of the contact stiffness.
@@ -59,7 +59,7 @@ def inputs_type(real, drag: bool):
     `settled` [m]: a node that an update moves by more is not moved by rounding alone; see `kernels.newton.line_search`.
     `longest` [m]: longest edge, which bounds coordinates of both ends and so the rounding of an edge vector.
     """
-    V, Mass = wp.types.vector(3, real), mass_type(real, drag)
+    V, Mass = wp.types.vector(3, real), mass_type(real, quadratic)
 
     @wp.struct
     class Given:
@@ -125,10 +125,10 @@ def largest_function(real, size: int = 3):
 
 
 @cache
-def residual_functions(real, linear, drag: bool, contact: bool, angle: bool = False):
+def residual_functions(real, linear, quadratic: bool, contact: bool, angle: bool = False):
     """Return the device functions `outer` and `settle` of a block.
 
-    `outer(...) -> (force, size, stiff, change)`: loads, gravity, inertia, drag and contact.
+    `outer(...) -> (force, size, stiff, change)`: loads, gravity, inertia and contact.
     `settle(...)`: write the residual and test convergence.
 
     With `angle` the block is a twist angle, and vectors have one component.
@@ -136,7 +136,7 @@ def residual_functions(real, linear, drag: bool, contact: bool, angle: bool = Fa
     dofs = 1 if angle else 3
     V, H = wp.types.vector(3, real), wp.types.vector(3, linear)
     X, M, R = wp.types.vector(dofs, real), wp.types.matrix((3, 3), real), wp.types.matrix((dofs, dofs), real)
-    Given, Found = inputs_type(real, drag), results_type(real, linear)
+    Given, Found = inputs_type(real, quadratic), results_type(real, linear)
     largest = largest_function(real, dofs)
 
     @wp.func
@@ -160,7 +160,7 @@ def residual_functions(real, linear, drag: bool, contact: bool, angle: bool = Fa
         """Return force, size, stiffness, and energy change along the step, without contact energy."""
         x = dofs_of(inputs.q[i])
         force = dofs_of(inputs.load[i])
-        if wp.static(drag):
+        if wp.static(quadratic):
             m = dofs_of(inputs.mass[w, k].mass)
         else:
             m = dofs_of(inputs.mass[w, k])
@@ -171,12 +171,12 @@ def residual_functions(real, linear, drag: bool, contact: bool, angle: bool = Fa
         u = x - dofs_of(inputs.base[i])
         change = wp.dot(u, inertia - wp.cw_mul(m, u) * (real(0.5) * c) - force)
         stiff = c * largest(m)
-        if wp.static(drag):
-            resistance = square(inputs.mass[w, k].resistance)
-            held_back = resistance * (x - dofs_of(inputs.mass[w, k].carried))
+        if wp.static(quadratic):
+            stiffness = square(inputs.mass[w, k].stiffness)
+            held_back = stiffness * (x - dofs_of(inputs.mass[w, k].reference))
             inertia += held_back
-            change += wp.dot(u, held_back - resistance * u * real(0.5))
-            stiff += wp.max(wp.get_diag(resistance))
+            change += wp.dot(u, held_back - stiffness * u * real(0.5))
+            stiff += wp.max(wp.get_diag(stiffness))
         if wp.static(contact):
             force += dofs_of(inputs.push[i])
             stiff += inputs.pressed[i]
@@ -247,15 +247,15 @@ ITEM = 16  # an item is element * ITEM + local node index
 
 
 @cache
-def balance_kernel(real, linear, drag: bool, contact: bool, serial: bool):
+def balance_kernel(real, linear, quadratic: bool, contact: bool, serial: bool):
     """Build the kernel of the residual.
 
     `balance`: write residual and energy change of the blocks `some`, or of all if empty.
     """
     V, Meeting = wp.types.vector(3, real), meeting_type(real, linear)
-    Given, Found, F = inputs_type(real, drag), results_type(real, linear), wp.types.matrix((3, 3), real)
+    Given, Found, F = inputs_type(real, quadratic), results_type(real, linear), wp.types.matrix((3, 3), real)
     until = until_function(serial)
-    outer, settle = residual_functions(real, linear, drag, contact)
+    outer, settle = residual_functions(real, linear, quadratic, contact)
     largest = largest_function(real)
 
     @wp.func

@@ -93,15 +93,15 @@ def force_function(terms: tuple[Term, ...], real, linear):
 
 
 @cache
-def path_node_kernel(terms: tuple[Term, ...], twist: bool, real, linear, drag: bool, contact: bool, serial: bool):
+def path_node_kernel(terms: tuple[Term, ...], twist: bool, real, linear, quadratic: bool, contact: bool, serial: bool):
     """Build the kernel of residuals of path nodes.
 
     `balance`: write the residuals of their nodes and angles, except blocks `elsewhere`; see `kernels.linear.sliced_ell`.
     """
-    Along, Given, Found = along_type(real, linear), inputs_type(real, drag), results_type(real, linear)
+    Along, Given, Found = along_type(real, linear), inputs_type(real, quadratic), results_type(real, linear)
     M, until = wp.types.vector(1, real), until_function(serial)
-    outer, settle = residual_functions(real, linear, drag, contact)
-    outer_of_angle, settle_angle = residual_functions(real, linear, drag, contact, True)
+    outer, settle = residual_functions(real, linear, quadratic, contact)
+    outer_of_angle, settle_angle = residual_functions(real, linear, quadratic, contact, True)
     collect = force_function(terms, real, linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)

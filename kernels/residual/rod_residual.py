@@ -98,7 +98,7 @@ def evaluate_kernel(
         project: True if all rods drop compression, second derivatives or not.
         reuse: True if factors are written at the first iterate of a step only.
     """
-    dim, nb, twist, span, closed, drag = kind.dim, kind.block, kind.twist, kind.span, kind.closed, kind.drag
+    dim, nb, twist, span, closed, quadratic = kind.dim, kind.block, kind.twist, kind.span, kind.closed, kind.quadratic
     prepared = kind.prepared is not None
     V, Inertia, storage = wp.types.vector(dim, real), inertia_type(kind, real), rod_storage(kind, real, prepared)
     W, Inputs, Results = storage.Window, storage.Inputs, results_type(real, linear, False)
@@ -278,13 +278,13 @@ def evaluate_kernel(
             if wp.static(twist):
                 elastic = g[wp.static(angle)] + moment_ahead
             if owned:
-                if wp.static(drag):
+                if wp.static(quadratic):
                     m = inertia.mass
                 else:
                     m = inertia
                 f = gravity[0] * m - (position - goal) * (c * m)
-                if wp.static(drag):
-                    f -= inertia.resistance * (position - inertia.carried)
+                if wp.static(quadratic):
+                    f -= inertia.stiffness * (position - inertia.reference)
                 moment = real(0.0)
                 if loaded != 0:
                     f += load[k, r]
@@ -299,8 +299,8 @@ def evaluate_kernel(
                 # an edge is as exact as the larger one of its ends
                 magnitude = wp.max(wp.max(wp.abs(position)), wp.max(wp.abs(next_position)))
                 least = rounding_factor * ((real(2.0) * stiffest + c * m) * magnitude + size)
-                if wp.static(drag):
-                    least += rounding_factor * wp.max(wp.get_diag(inertia.resistance)) * magnitude
+                if wp.static(quadratic):
+                    least += rounding_factor * wp.max(wp.get_diag(inertia.stiffness)) * magnitude
                 if wp.static(real is wp.float32):
                     doubtful = real(wp.static(ROUNDED)) * scalars[LOAD_SCALE, r]
                     settled = real(wp.static(SETTLED)) * length[r]
@@ -348,8 +348,8 @@ def evaluate_kernel(
                     if loaded != 0:
                         outer += load[k, r]
                     work = wp.dot(u, (position - goal - u * real(0.5)) * (c * m) - outer)
-                    if wp.static(drag):
-                        work += wp.dot(u, inertia.resistance * (position - inertia.carried - u * real(0.5)))
+                    if wp.static(quadratic):
+                        work += wp.dot(u, inertia.stiffness * (position - inertia.reference - u * real(0.5)))
                     if wp.static(twist):
                         rotation_step = taken * real(step[wp.static(nb - 1)])
                         work += rotation_step * c * spin * (theta - goal_angle - real(0.5) * rotation_step)

@@ -1,7 +1,7 @@
 """Reactions of fixed dofs over a step: the residual there, which no solve makes zero.
 
 The solved residual of a node is external minus inertial minus internal force. At a fixed dof it is minus the reaction of the support.
-It holds damping, drag, inertia, contact and loads. It is the mean force over a solve, which balances the momentum of the step: at its
+It holds inertia, damping, all forces and contact. It is the mean force over a solve, which balances the momentum of the step: at its
 end for implicit Euler, at its midpoint for the midpoint rule.
 
 `element_force_kernel` evaluates the elements next to fixed dofs alone, at the solution. Reactions of substeps are weighted by their
@@ -194,7 +194,7 @@ def rod_reaction_kernel(kind: RodKind, real):
 
     `react`: add forces and moments of entries over an accepted substep, or replace the sums of earlier ones.
     """
-    dim, twist, drag = kind.dim, kind.twist, kind.drag
+    dim, twist, quadratic = kind.dim, kind.twist, kind.quadratic
     V, X, Inertia, Entries = (
         wp.types.vector(dim, real),
         wp.types.vector(3, real),
@@ -241,13 +241,13 @@ def rod_reaction_kernel(kind: RodKind, real):
                     reaction[0] = reaction[0] - load_angle[k, r]
             edge = lifted(x[entries.ends[i][1], r] - x[entries.ends[i][0], r])
         else:
-            if wp.static(drag):
+            if wp.static(quadratic):
                 m = mass[k, r].mass
             else:
                 m = mass[k, r]
             outer = (x[k, r] - target[k, r]) * (c * m) - gravity[0] * m
-            if wp.static(drag):
-                outer += mass[k, r].resistance * (x[k, r] - mass[k, r].carried)
+            if wp.static(quadratic):
+                outer += mass[k, r].stiffness * (x[k, r] - mass[k, r].reference)
             if loaded != 0:
                 outer -= load[k, r]
             reaction += lifted(outer)
@@ -269,14 +269,14 @@ def rod_reaction_kernel(kind: RodKind, real):
 
 
 @cache
-def coupled_reaction_kernel(real, linear, drag: bool, contact: bool):
+def coupled_reaction_kernel(real, linear, quadratic: bool, contact: bool):
     """Build the kernel of reactions on the coupled system.
 
     `react`: add forces and moments of entries over an accepted substep.
     """
-    X, Given, Entries = wp.types.vector(3, real), inputs_type(real, drag), entries_type(real)
+    X, Given, Entries = wp.types.vector(3, real), inputs_type(real, quadratic), entries_type(real)
     gathered, _, add = _add_functions(3, real)
-    outer, _ = residual_functions(real, linear, drag, contact)
+    outer, _ = residual_functions(real, linear, quadratic, contact)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def react(

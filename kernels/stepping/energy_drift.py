@@ -18,12 +18,11 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.core import outcome
+from ddg_warp.kernels.core.inertia import block_inertia, node_inertia
 from ddg_warp.kernels.core.islands import INVERSE_STEP, STATUS, STEP_PROGRESS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.core.nodes import NodeStorage, dof_functions, mass_functions, state_type
 from ddg_warp.kernels.elements.element_path import ElementStorage, parameter_function
-from ddg_warp.kernels.elements.rod_layout import drag_structure
-from ddg_warp.kernels.forces.drag import block_inertia
 from ddg_warp.kernels.terms import Term
 
 DRIFT, ROUNDING, ENERGY, DISSIPATED = range(4)  # rows of a balance
@@ -154,16 +153,16 @@ def element_kernel(storage: ElementStorage, real, linear):
 
 
 @cache
-def node_kernel(nodes: NodeStorage, real, drag: bool):
+def node_kernel(nodes: NodeStorage, real, quadratic: bool):
     """Build the kernel of the rows of nodes.
 
-    `measure`: sum work of follower loads, kinetic energy at the end, and dissipation by damping and drag, over the nodes first,
-    first + ranges, ... of an island.
+    `measure`: sum work of follower loads, kinetic energy at the end, and dissipation by damping and the quadratic potential, over the
+    nodes first, first + ranges, ... of an island.
     """
     V, M, B = wp.types.vector(nodes.dim, real), nodes.mass_type(real), wp.types.vector(ROWS, real)
     State, (items, _), twist = state_type(nodes, real), nodes.thread_functions, nodes.twist
     (dofs, _), (masses, _) = dof_functions(nodes, real), mass_functions(nodes, real)
-    Inertia = block_inertia(real) if nodes.coupled else drag_structure(nodes.dim, real)
+    Inertia = block_inertia(real) if nodes.coupled else node_inertia(nodes.dim, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def measure(
@@ -185,7 +184,7 @@ def node_kernel(nodes: NodeStorage, real, drag: bool):
         ranges: int,
         rows_out: wp.array3d(dtype=real),
     ):
-        """Sum rows; `load` is the load at the iterate x, `load_solved` the load of the solve, `resisted` inertia and drag."""
+        """Sum rows; `load` is the load at the iterate x, `load_solved` the load of the solve, `resisted` the inertia."""
         i, j = wp.tid()
         island, first = items(i, j)
         if scalars[STEP_PROGRESS, island] >= real(1.0):
@@ -198,9 +197,9 @@ def node_kernel(nodes: NodeStorage, real, drag: bool):
             v = moved * rate - dofs(before.v, before.omega, k, island)
             kinetic = real(0.5) * wp.dot(wp.cw_mul(m, v), v)
             damped = damping[0] * rate * wp.dot(wp.cw_mul(m, moved), moved)
-            if wp.static(drag):
-                away = x[k, island] - resisted[k, island].carried
-                damped += real(2.0) * wp.dot(away, resisted[k, island].resistance * away)
+            if wp.static(quadratic):
+                away = x[k, island] - resisted[k, island].reference
+                damped += real(2.0) * wp.dot(away, resisted[k, island].stiffness * away)
                 if wp.static(twist):
                     rotated = moved[wp.static(nodes.dim)]
                     damped += real(2.0) * resisted[k, island].spin * rotated * rotated

@@ -190,7 +190,7 @@ class CoupledSystem(DofStorage):
         """(nodes (2, E), angle block or -1 (E,), coefficients (rows, E)) of edges with drag; None without any."""
         pieces = []
         for rod in self.rods:
-            if rod.piece.kind.drag:
+            if rod.piece.kind.quadratic:
                 coefficients = rod.piece.drag[rod.row]
                 ends = rod.ends[: len(coefficients)].T
                 angles = rod.all_edges if rod.all_edges.size else np.full(len(coefficients), -1)
@@ -268,6 +268,6 @@ class CoupledSystem(DofStorage):
 def inert_mass(piece, s: float) -> np.ndarray:
     """Return the mean nodal mass of rods of a piece (R,) [kg], plus drag times the step length s [s]."""
     mass = piece.mass.mean(1)
-    if piece.kind.drag:
+    if piece.kind.quadratic:
         mass = mass + s * drag.least(piece.drag) * piece.length / piece.mass.shape[1]
     return mass

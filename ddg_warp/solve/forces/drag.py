@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import device_arrays
+from ddg_warp.kernels.core.inertia import block_inertia
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.elements import rod_layout
 from ddg_warp.kernels.forces import drag
@@ -123,7 +124,7 @@ class CoupledDrag(Drag):
     def at(self, state, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Return inertia and drag (world, block) of a state at t over a second, and the flow (blocks, 3)."""
         coupled, device = self.part, self.model.wp_device
-        mass = wp.zeros((coupled.worlds, coupled.blocks), dtype=drag.block_inertia(coupled.real), device=device)
+        mass = wp.zeros((coupled.worlds, coupled.blocks), dtype=block_inertia(coupled.real), device=device)
         self.upload(t, t)
         self.resist(state, state.q, mass, coupled.still, self._over_a_second())
         flow = np.zeros((coupled.blocks, 3))

@@ -22,14 +22,14 @@ class ExactSystem:
     """Linear system (H + c M) w = g on the free dofs of every world, with the exact Hessian H at the solution of a step.
 
     The solve resembles a direction of `CoupledNewton`. But all of H is in one array, in float64 whatever the precision of the model,
-    and the tolerance is its own. H is symmetric, as drag is, and loads do not follow within a step; it may be indefinite, at a
-    saddle. The host reads nothing.
+    and the tolerance is its own. H is symmetric, and loads do not follow within a step; it may be indefinite, at a saddle. The host
+    reads nothing.
 
     Measured: on a CPU the reverse of a step takes a quarter to a half of the time of sparse factors where rods branch. Large sheets
     and gridshells take up to twice and three times that time (tools/results/gradient_nets_cpu.csv).
 
     Args:
-        inertia: inertia and drag of the blocks (worlds, N); None without drag.
+        inertia: inertia of the blocks (worlds, N) with a quadratic potential; None without potential.
         contact: `ExactContact` at the solution; None without contact.
 
     Attributes:
@@ -50,20 +50,20 @@ class ExactSystem:
         def make(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        preconditioner, drag = coupled_preconditioner(coupled), inertia is not None
+        preconditioner, quadratic = coupled_preconditioner(coupled), inertia is not None
         self.substructuring = RodSubstructuring.of(coupled, preconditioner, banded=False)
         self.sparsity = SparseSystem(coupled)
         self.planes = SkewSupports(coupled, self.sparsity, real, self.linear) if host.frames else None
         if self.substructuring:
-            self.substructuring.bind(self.sparsity, [], self.linear, (), drag)
+            self.substructuring.bind(self.sparsity, [], self.linear, (), quadratic)
             if contact:
                 contact.hessian.bind(self.substructuring)
-        self.mass = inertia if drag else coupled.mass
+        self.mass = inertia if quadratic else coupled.mass
         self.islands = Islands(worlds, real, device)
         wanted = self.islands.needs_direction
         self.system = LinearSystem.of(coupled, self.sparsity, self.substructuring, self.linear, wanted, wanted)
         self.failed = make(worlds, int)
-        self._begin, self._add = exact_kernels(real, self.linear, drag, device_arrays.serial(device))
+        self._begin, self._add = exact_kernels(real, self.linear, quadratic, device_arrays.serial(device))
         self._into, self._back, self._keep = block_kernels(real, self.linear)
         self._rest, self._check = check_kernels(self.linear)
         self._hessians = [

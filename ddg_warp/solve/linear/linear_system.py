@@ -14,7 +14,7 @@ class DofMasks:
     Attributes:
         fixed: (N,) fixed dofs, common to all worlds.
         spatial: (N,) fixed dofs without the skew supports, for predictors: rates along these stay in their planes.
-        kept: (N,) `spatial` and massless dofs without drag, which predictors keep.
+        kept: (N,) `spatial` and massless dofs without a quadratic potential, which predictors keep.
         inactive: (W N,) fixed dofs and, in contact, dofs of sleeping islands.
         idle_paths: (columns,) nonzero for rod paths of a `RodSubstructuring` without active dofs.
     """

@@ -14,7 +14,7 @@ class RodBands:
 
     Args:
         plan: bound `SubstructuringPlan`; sparsity: `SparseSystem` with all other entries.
-        written, exact_from, drag: see `MatrixAssembly`.
+        written, exact_from, quadratic: see `MatrixAssembly`.
         banded: True if the blocks are in bands alone; False for copies of blocks in the sparse matrix.
         exact: True if no products are needed.
         factors: storage of the bands if these are not needed after factorisation; else None.
@@ -27,7 +27,7 @@ class RodBands:
     """
 
     def __init__(
-        self, coupled, plan, paths, sparsity, written, linear, exact_from, drag, banded: bool, exact: bool, factors
+        self, coupled, plan, paths, sparsity, written, linear, exact_from, quadratic, banded: bool, exact: bool, factors
     ):
         self.coupled, self.paths, self.sparsity, real = coupled, paths, sparsity, coupled.real
         device, contact, size = coupled.device, coupled.host.contact_parameters is not None, 3 * plan.block**2
@@ -41,7 +41,7 @@ class RodBands:
         self.sets = wp.array(self._of_sets, dtype=along_struct, device=device)
         serial = device_arrays.serial(device)
         self._assemble, self._clear, self._product = rod_bands.band_kernels(
-            self.terms, plan.twist, plan.span, real, linear, self.exact_from, drag, serial, plan.mixed_axial
+            self.terms, plan.twist, plan.span, real, linear, self.exact_from, quadratic, serial, plan.mixed_axial
         )
         if serial:
             self._product = rod_bands.product_walk_kernel(plan.twist, plan.span, linear, plan.mixed_axial)
@@ -53,7 +53,7 @@ class RodBands:
         outside[self.elsewhere] = 1
         self._apart = wp.array(outside, dtype=wp.uint8, device=device)
         self._balance = (
-            path_node_kernel(self.terms, plan.twist, real, linear, drag, contact, serial) if banded else None
+            path_node_kernel(self.terms, plan.twist, real, linear, quadratic, contact, serial) if banded else None
         )
         self._multiplies = banded and not exact
         self.longer = self._lengthen = None

@@ -63,7 +63,9 @@ class RodSubstructuring:
         few = long_and_few(longest, self.coupled.worlds * width, wp.get_device(self.device))
         return self.mixed_axial or (self.banded and self.plan.joins_paths_only and not (few or self._contact))
 
-    def bind(self, sparsity, written: list[dict], linear, exact_from: tuple, drag: bool, reuse: bool = False) -> None:
+    def bind(
+        self, sparsity, written: list[dict], linear, exact_from: tuple, quadratic: bool, reuse: bool = False
+    ) -> None:
         """Bind the `SparseSystem`, without entries stored in bands, and the element outputs of all sets; see `MatrixAssembly`.
 
         With `reuse` one matrix serves several directions. Contact blocks of H are added to `bands.eliminated` before `prepare`.
@@ -82,12 +84,12 @@ class RodSubstructuring:
         self._elimination = PathElimination(coupled, plan, paths, linear, kernels, reduces, repeated)
         in_place = reduces or self.exact or not self.banded  # the blocks are not needed after factorisation
         factors = self._elimination.factors if in_place else None
-        outputs = written, linear, exact_from, drag
+        outputs = written, linear, exact_from, quadratic
         self.bands = RodBands(coupled, plan, paths, sparsity, *outputs, self.banded, self.exact, factors)
         self._walk = None
         if self.exact and serial and not (reduces or reuse or self.mixed_axial):
             of_terms = self.bands.terms, plan.twist, plan.span, coupled.real, linear, self.bands.exact_from
-            self._walk = walk_kernel(*of_terms, drag, self._joints.count > 0)
+            self._walk = walk_kernel(*of_terms, quadratic, self._joints.count > 0)
 
     @property
     def kernels(self) -> list:

@@ -146,7 +146,7 @@ class MatrixAssembly:
         written: the arrays "factor", "tension" and "second" of each set.
         exact_from: first iteration of each set with second derivatives, or None.
         local: for each set, True if its factor is of the local dofs.
-        drag: True if blocks have more than a mass.
+        quadratic: True if blocks have a quadratic potential; see `kernels.core.inertia`.
     """
 
     def __init__(
@@ -157,7 +157,7 @@ class MatrixAssembly:
         linear,
         exact_from: tuple,
         local: tuple,
-        drag: bool,
+        quadratic: bool,
     ):
         serial = device_arrays.serial(coupled.device)
         self.coupled, self.table, self.kernels, self._own = coupled, table, [], []
@@ -166,7 +166,7 @@ class MatrixAssembly:
                 each[first : first + sliced_ell.SETS] for each in (coupled.sets, exact_from, local)
             )
             terms = tuple(part.term for part in sets)
-            layout = from_iteration, local_dofs, drag, table.has_angles, serial
+            layout = from_iteration, local_dofs, quadratic, table.has_angles, serial
             self.kernels.append(sliced_ell.assemble_kernel(terms, coupled.real, linear, first == 0, *layout))
             set_data = []
             for i in range(first, first + len(sets)):

@@ -47,7 +47,7 @@ class CoupledNewton:
             `kernels.linear.rod_substructuring`), "multilevel" (see `kernels.linear.multilevel`), or "substructuring_multilevel",
             both.
         linear: scalar type of the linear algebra; default: the model's.
-        drag: True if blocks have more than a mass; see `kernels.forces.drag`.
+        quadratic: True if blocks have a quadratic potential; see `kernels.core.inertia`.
         reuse: True if the matrix of a step's first iterate serves the whole step.
         mixed_axial: True if edges may be stiffer than the matrix carries, where possible; see `RodSubstructuring.allows_mixed_axial`.
 
@@ -68,7 +68,7 @@ class CoupledNewton:
         options: NewtonOptions,
         preconditioner: str = "block_jacobi",
         linear=None,
-        drag: bool = False,
+        quadratic: bool = False,
         reuse: bool = False,
         mixed_axial: bool = False,
     ):
@@ -97,12 +97,12 @@ class CoupledNewton:
         banded = self.substructuring is not None and self.substructuring.banded
         self.elements = ElementEvaluation(coupled, self.psd, self.linear, banded, mixed_axial)
         matrix = self.sparsity, self.elements.outputs, self.linear, self.elements.exact_from
-        self._assembly = MatrixAssembly(coupled, *matrix, self.elements.local, drag)
+        self._assembly = MatrixAssembly(coupled, *matrix, self.elements.local, quadratic)
         if self.substructuring:
-            self.substructuring.bind(*matrix, drag, reuse)
+            self.substructuring.bind(*matrix, quadratic, reuse)
         self.iterates, self.norms = Iterates.of(coupled), ResidualNorms.of(coupled)
         self.search_state, self.tolerances = SearchState.of(coupled), ResidualTolerances(coupled, real, self.linear)
-        self.loading = Loading.of(coupled, model.scene.gravity, drag, self.tolerances)
+        self.loading = Loading.of(coupled, model.scene.gravity, quadratic, self.tolerances)
         self.contact = None
         if host.contact_parameters:
             self.contact = NewtonContact(model, self.iterates, self.islands.inverse_step, self.linear, self.psd)
@@ -136,7 +136,7 @@ class CoupledNewton:
             self.linear,
             options.rtol,
             options.floor_factor * self._eps,
-            drag,
+            quadratic,
         )
         most = int(options.unconverged_fraction * self.contact.touching_bodies) if self.contact else 0
         self.line_search = LineSearch(coupled, self.linear, most > 0)

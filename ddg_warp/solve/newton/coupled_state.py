@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.compile.residual_tolerance import outer_forces
-from ddg_warp.kernels.forces.drag import block_inertia
+from ddg_warp.kernels.core.inertia import block_inertia
 
 
 @dataclass
@@ -44,7 +44,7 @@ class Loading:
     """Inertia and external forces of a solve.
 
     Attributes:
-        mass: (W, N) masses, or inertia with drag, see `kernels.forces.drag`.
+        mass: (W, N) masses, or inertia with a quadratic potential, see `kernels.core.inertia`.
         gravity: (1,) [m/s^2]; force: (W N,) other forces on dof blocks [N, N m].
         scale: (W,) load scale, relative to the loads that residual tolerances count.
     """
@@ -55,11 +55,11 @@ class Loading:
     scale: wp.array
 
     @classmethod
-    def of(cls, coupled, gravity, drag: bool, tolerances) -> "Loading":
+    def of(cls, coupled, gravity, quadratic: bool, tolerances) -> "Loading":
         """Return the constant loads; assigns the loads of bodies to the residual tolerances."""
         host, worlds, device = coupled.host, coupled.worlds, coupled.device
         mass = coupled.mass
-        if drag:
+        if quadratic:
             mass = wp.zeros((worlds, coupled.blocks), dtype=block_inertia(coupled.real), device=device)
         gravity = np.asarray(gravity, float)
         scale = tolerances.assign(tolerances.bodies.loads(outer_forces(host, gravity))[None])

@@ -17,7 +17,7 @@ class ResidualAssembler:
         `substructuring`, `planes`, `contact`: `RodSubstructuring`, `SkewSupports` and `ContactPotential`, or None.
         tolerances: `ResidualTolerances`, whose ratios of blocks and rounding floors are written.
         rtol: relative tolerance; floor: rounding floor over the rounding bound.
-        drag: True if blocks have more than a mass.
+        quadratic: True if blocks have a quadratic potential; see `kernels.core.inertia`.
 
     Attributes:
         inputs: arrays of the last residual, see `kernels.residual.coupled_residual.inputs_type`.
@@ -35,11 +35,11 @@ class ResidualAssembler:
         linear,
         rtol: float,
         rounding_factor: float,
-        drag,
+        quadratic,
     ):
         self.coupled, host, real, lengths = coupled, coupled.host, coupled.real, coupled.host.edge_lengths
         self.bands = substructuring.bands if substructuring and substructuring.banded else None
-        self.inputs = inputs = coupled_residual.inputs_type(real, drag)()
+        self.inputs = inputs = coupled_residual.inputs_type(real, quadratic)()
         self._outputs = outputs = coupled_residual.results_type(real, linear)()
         inputs.arm, inputs.longest, inputs.settled = lengths.mean(), lengths.max(), SETTLED * host.bodies.shortest
         inputs.blocks, inputs.nodes, inputs.rtol, inputs.rounding_factor = (
@@ -64,7 +64,7 @@ class ResidualAssembler:
             else [wp.zeros(0, dtype=dtype, device=coupled.device) for dtype in types]
         )
         serial = device_arrays.serial(coupled.device)
-        self.kernels = [coupled_residual.balance_kernel(real, linear, drag, contact is not None, serial)]
+        self.kernels = [coupled_residual.balance_kernel(real, linear, quadratic, contact is not None, serial)]
 
     def __call__(self, iterates, loading, norms, system, islands) -> None:
         """Assemble the residuals at the iterate, with norms."""

@@ -44,7 +44,7 @@ class RodLoading:
     """Inertia and external forces of a solve.
 
     Attributes:
-        mass, rotary: inertia of nodes and of twist; own arrays with drag, see `kernels.forces.drag`.
+        mass, rotary: inertia of nodes and of twist; own arrays with a quadratic potential, see `kernels.core.inertia`.
         force, moment: forces on nodes and moments about edges, if `loaded`.
     """
 
@@ -58,7 +58,7 @@ class RodLoading:
     def of(cls, group, iterates: RodIterates) -> "RodLoading":
         """Return the constant loads of a group."""
         mass, rotary = group.mass, group.rotary
-        if group.kind.drag:
+        if group.kind.quadratic:
             inertia = rod_layout.inertia_type(group.kind, iterates.theta.dtype)
             mass = device_arrays.allocate(iterates.x.shape, inertia, group.device)
             rotary = device_arrays.allocate(iterates.theta.shape, iterates.theta.dtype, group.device)

@@ -107,7 +107,7 @@ class RodEnergy(_Energy):
             self._loads = [wp.clone(load) for load in self._loads]
         real = self.model.types.real
         self._elements = [energy_drift.element_kernel(rod_storage(group.kind, real), real, newton.linear)]
-        self._nodes = energy_drift.node_kernel(group.kind.nodes, real, group.kind.drag)
+        self._nodes = energy_drift.node_kernel(group.kind.nodes, real, group.kind.quadratic)
 
     @timer("energy")
     def check_drift(self, before, start) -> None:
@@ -123,7 +123,7 @@ class RodEnergy(_Energy):
         self._launch(self._elements[0], grid, read, [self.rows[:, : self.ranges]])
         read = [group.node_state(before), iterates.x, iterates.theta, group.mass, group.rotary]
         read += [
-            loading.mass if group.kind.drag else None,
+            loading.mass if group.kind.quadratic else None,
             group.count,
             *self._loads,
             loading.force,

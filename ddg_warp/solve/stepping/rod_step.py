@@ -54,7 +54,7 @@ class RodStep(StepDriver):
             self.loads = Loads(model, group, self.midpoint)
         self.energy = energy_drift.RodEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.motion = Motion(model, group, self.midpoint) if group.host.moves else None
-        self.drag = RodGroupDrag(model, group, self.midpoint) if kind.drag else None
+        self.drag = RodGroupDrag(model, group, self.midpoint) if kind.quadratic else None
 
     @property
     def index(self) -> int:

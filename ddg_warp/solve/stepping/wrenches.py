@@ -283,7 +283,7 @@ class RodReactions(_Reactions):
 
     def add_static(self, state, load: np.ndarray) -> None:
         """Add the reactions at a state; see `Wrenches.at`."""
-        group, kind = self.part, replace(self.part.kind, drag=False)
+        group, kind = self.part, replace(self.part.kind, quadratic=False)
         load = load.reshape(group.columns, group.nodes, kind.block).swapaxes(0, 1)
         vector = wp.types.vector(kind.dim, self._real)
         force = device_arrays.upload(np.ascontiguousarray(load[..., : kind.dim]), vector, self._device)
