@@ -96,7 +96,7 @@ def balance(integrator, before, after, dt) -> tuple:
         inner = part.mass * ((v1 - v0) / dt + damping * v)
         outer = part.loads(after.time, q) if model.scene.loads else part.weight().ravel()
         drag = np.zeros_like(q)
-        if stepper.drag:
+        if stepper.inertia:
             drag = resistance(part, stepper, q, q0)
         host = part.host
         x = q[host.dofs(np.arange(host.nodes))] if host.axes == (0, 1, 2) else planar(q, host)

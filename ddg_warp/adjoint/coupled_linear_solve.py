@@ -21,7 +21,7 @@ class CoupledLinearSolve:
     Host solves use sparse factors; dL/dq is the load stiffness of equilibria.
 
     Args:
-        drag: `CoupledDragAdjoint`, None without drag.
+        quadratic: adjoint of the force with a quadratic potential, see `adjoint.forces`; None without.
         contact: `ExactContact`, evaluated at the solution of a step; None without contact.
         steps: True for steps.
 
@@ -31,10 +31,10 @@ class CoupledLinearSolve:
         held: of the last host solve, the load-stiffness term of the gradient by fixed dofs (W N,); None without follower loads.
     """
 
-    def __init__(self, model, drag, contact, steps: bool):
+    def __init__(self, model, quadratic, contact, steps: bool):
         coupled = self.coupled = model.coupled
-        self.model, self.drag = model, drag
-        self.system = ExactSystem(model, drag and drag.inertia, contact) if steps else None
+        self.model, self._quadratic = model, quadratic
+        self.system = ExactSystem(model, quadratic and quadratic.inertia, contact) if steps else None
         self.failed = self.system and self.system.failed
         self.held = None
         self._rate = wp.zeros(coupled.worlds, dtype=coupled.real, device=coupled.device)
@@ -83,7 +83,7 @@ class CoupledLinearSolve:
                 outcome="no_gradient",
             )
         tangent, host = self.tangent, self._host
-        more = self.drag.matrix if self.drag else None
+        more = self._quadratic.matrix if self._quadratic else None
         rhs = tangent.into(rhs.numpy().astype(float).ravel())
         solution = host(
             SimpleNamespace(coupled=state), rate, coefficient, None if rate else time, rhs, more, friction_jacobian

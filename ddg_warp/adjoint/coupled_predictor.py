@@ -61,7 +61,7 @@ class CoupledPredictor:
     def of(cls, model, coupled, motion, scheme: str | None) -> "CoupledPredictor | None":
         """Return the predictor of a scheme; None if solves lag nothing at the predicted configuration."""
         midpoint = scheme == "implicit_midpoint"
-        needed = scheme and (coupled.host.followers or (midpoint and (coupled.edges or coupled.host.drag)))
+        needed = scheme and (coupled.host.followers or (midpoint and (coupled.edges or coupled.host.quadratic)))
         return cls(model, coupled, motion, midpoint) if needed else None
 
     @property

@@ -14,8 +14,7 @@ from ddg_warp.adjoint.contact import ContactAdjoint
 from ddg_warp.adjoint.coupled_assembly import CoupledAssembly
 from ddg_warp.adjoint.coupled_linear_solve import CoupledLinearSolve
 from ddg_warp.adjoint.coupled_predictor import CoupledPredictor
-from ddg_warp.adjoint.drag import CoupledDragAdjoint
-from ddg_warp.adjoint.follower_loads import Followers
+from ddg_warp.adjoint.forces import ForceCotangents, force_adjoints, quadratic_of
 from ddg_warp.adjoint.supports import Supports
 from ddg_warp.kernels.adjoint import coupled_step, elements, time_step
 from ddg_warp.kernels.elements.coupled_element import FRAME, coupled_storage
@@ -117,13 +116,15 @@ class CoupledStepAdjoint:
         midpoint = scheme == "implicit_midpoint"
         self.supports = Supports(model, coupled, midpoint) if (scheme or posed) and host.moves else None
         motion = self.supports.motion if self.supports else None
-        self._midpoint, drag = midpoint, bool(host.drag and scheme)
-        self.followers = Followers(model, coupled, midpoint) if host.followers and scheme else None
+        self._midpoint = midpoint
         self.predictor = CoupledPredictor.of(model, coupled, motion, scheme)
         self._shares = CoupledAssembly(model)
-        self.drag = CoupledDragAdjoint(model, coupled, midpoint, self._shares.gather) if drag else None
+        self.forces = force_adjoints(model, coupled, midpoint, self._shares.gather) if scheme else []
+        self._quadratic = quadratic_of(self.forces)
         self.contact = ContactAdjoint(coupled) if host.contact_parameters else None
-        self.solve = CoupledLinearSolve(model, self.drag, self.contact and self.contact.system, scheme is not None)
+        self.solve = CoupledLinearSolve(
+            model, self._quadratic, self.contact and self.contact.system, scheme is not None
+        )
         self.gravity = wp.array(
             np.tile(model.scene.gravity, (coupled.worlds, 1)), dtype=coupled.vector, device=self.device
         )
@@ -134,9 +135,11 @@ class CoupledStepAdjoint:
             elements.strain_vjp_kernel(storage, 0, real, True) if part.term.density.lagged else None
             for storage, part in zip(storages, coupled.sets, strict=True)
         ]
-        self._solution, self._inertia, self._start = time_step.step_kernels(coupled.nodes, real, midpoint, drag)
+        self._solution, self._inertia, self._start = time_step.step_kernels(
+            coupled.nodes, real, midpoint, self._quadratic is not None
+        )
         self._ended = coupled_step.end_kernel(real)
-        self._resisted = self.drag.inertia.transpose((1, 0)) if drag else None
+        self._resisted = self._quadratic.inertia.transpose((1, 0)) if self._quadratic else None
         self._leaves = coupled.common(wp.zeros(coupled.blocks, dtype=wp.uint8, device=self.device))
         self._rates, self._friction_rate = (wp.zeros(coupled.worlds, dtype=real, device=self.device) for _ in range(2))
 
@@ -166,7 +169,7 @@ class CoupledStepAdjoint:
             rate=make(real),
             damping=make(real),
             gravity=make(),
-            drag=self.drag.by_coefficients if drag else None,
+            drag=self._quadratic.by_coefficients if self._quadratic else None,
             elements_rate=[
                 wp.zeros(part.elements * coupled.worlds, dtype=real, device=self.device) for part in coupled.sets
             ],
@@ -180,7 +183,7 @@ class CoupledStepAdjoint:
         """Kernels to load before a capture."""
         result = [*self._vjp, *(kernel for kernel in self._strains if kernel)]
         result += [self._solution, self._inertia, self._start, self._ended]
-        parts = (self._shares, self.solve, self.supports, self.drag, self.followers, self.predictor, self.contact)
+        parts = (self._shares, self.solve, self.supports, *self.forces, self.predictor, self.contact)
         return result + [kernel for part in parts if part for kernel in part.kernels]
 
     def suit(self, step, s: float) -> bool:
@@ -188,8 +191,8 @@ class CoupledStepAdjoint:
         return self.predictor is not None and self.predictor.suit(step, s)
 
     def upload(self, t0: float, t1: float) -> None:
-        """Upload supports, follower loads and flow between t0 and t1, the step to reverse."""
-        for part in filter(None, (self.supports, self.followers, self.drag and self.drag.drag)):
+        """Upload supports and forces between t0 and t1, the step to reverse."""
+        for part in filter(None, (self.supports, *(adjoint.force for adjoint in self.forces))):
             part.upload(t0, t1)
 
     def lagged(self, before: CoupledState, states=None) -> wp.array:
@@ -258,8 +261,8 @@ class CoupledStepAdjoint:
             self._launch(self._ended, len(ended), [solved.q, before.q], [ended])
         shares.uncarry(solved, after, ended, frame, of_end, by_end, inputs.end_data, carried, own_rows)
         # the solve
-        if self.drag:
-            self.drag.resist(before, tangents, rate)
+        if self._quadratic:
+            self._quadratic.resist(before, tangents, rate)
         points, components, grid = coupled.points, coupled.components, (coupled.worlds, coupled.blocks)
         self._rates.fill_(rate)
         end, out, began, more = *map(coupled.node_state, (cotangent, start, before)), components(by_end)
@@ -270,7 +273,6 @@ class CoupledStepAdjoint:
         rough, lag_pairs = None, reversed(list(pairwise([before.q, *kept.lagged, solved.q])))
         if kept.friction_rate:  # normal forces of the equilibrium
             rough, lag_pairs = self.contact.matrix(solved.q, before.q, self._friction_rate), [(solved.q, solved.q)]
-        by_tangents = by_predicted if self._midpoint else start.q
         for lag_q, q in lag_pairs:  # lag positions of friction, and the solution
             damped = replace(solved, q=q, last=before.last)
             if self.contact:
@@ -284,8 +286,11 @@ class CoupledStepAdjoint:
                 self._over(i, kernel, [coupled.elements(damped, i, rate=self._rates), w], written)
             shares.collect(grad_q, carried, inputs.data)
             shares.add_own(own_rows)
-            if self.drag:
-                self.drag.vjp(before, tangents, q, w, rate, grad_q, start, inputs.rate, by_tangents)
+            pull = ForceCotangents(
+                before, predictor and lagged.q, damped, w, rate, grad_q, start, inputs.rate, by_predicted
+            )
+            for force in self.forces:
+                force.vjp(pull)
             read = [points(q), None, began, components(w), *masses, coupled.count, coupled.host.nodes, last]
             read += [self._rates, self._damping, self.gravity, coupled.world]
             written = [out, points(inputs.mass), None, points(inputs.rate), points(inputs.damping)]
@@ -308,9 +313,6 @@ class CoupledStepAdjoint:
             frame, by_frame = (coupled.frames(array) for array in (solved.frame, carried))
             force, angle = coupled.components(grad_q), coupled.angles(grad_q)
             self.supports.vjp(coupled.points(solved.q), frame, force, angle, by_frame)
-        if self.followers:
-            gradients = coupled.components(inputs.load), coupled.angles(inputs.load), coupled.components(by_predicted)
-            self.followers.vjp(coupled.points(lagged.q), *gradients)
         if predictor:
             if predictor.carries:
                 written = by_predicted, inputs.data, carried_first, first
@@ -340,7 +342,7 @@ class CoupledStepAdjoint:
             *(cotangents.end, start.q, start.v, *start.last, *cotangents.frames, *own_rows),
             *(inputs.load, inputs.mass, inputs.rate, inputs.damping, inputs.gravity, *inputs.elements_rate),
             *(*inputs.parameters, *inputs.data, *inputs.end_data),
-            *([inputs.drag] if self.drag else []),
+            *([inputs.drag] if self._quadratic else []),
             *([self.contact.by_groups, self.contact.by_radius] if self.contact else []),
             *([self.solve.failed] if self.solve.failed is not None else []),
         ):

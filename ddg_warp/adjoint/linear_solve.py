@@ -50,7 +50,7 @@ class HostSolve:
             coefficient: c, zero for an equilibrium [1/s^2].
             factor: load parameter of an equilibrium, which has load stiffness dL/dq; None in a step, where loads are lagged.
             rhs: g (size,).
-            more: additional matrix, of drag; None without.
+            more: additional matrix, of a quadratic potential; None without.
             friction_jacobian: additional matrix, unsymmetric, of friction in an equilibrium; None without.
 
         A singular matrix, with zero stiffness along a motion, is accepted if g has no component along the motion.
@@ -197,7 +197,7 @@ class DirectSolve:
         islands.not_converged.fill_(1)  # assemble the matrices of all rods
         if resisted:
             adjoint, *states = resisted
-            adjoint.drag.resist(*states, loading.mass, loading.rotary, system.iterates.target_angle, islands)
+            adjoint.force.resist(*states, loading.mass, loading.rotary, system.iterates.target_angle, islands)
         system.evaluate(last)
         system.assemble_blocks()
         self.solver.solve(system.blocks, rhs, self._count, self._wanted, w, self.failed)
@@ -230,7 +230,7 @@ class RodLinearSolve:
             solved: the solution `x`, `theta` and its lagged `frame`.
             last: strains of the last step.
             s: length of the implicit Euler step [s]; infinite for an equilibrium with the load parameter `solved.time`.
-            resisted: with drag, its `RodDragAdjoint`, the state before the step, and the nodes of the tangents.
+            resisted: with a quadratic potential, the adjoint of its force, the state before, and the nodes of the tangents.
 
         Raises:
             SolverError: H is singular (host only; see `failed`).
@@ -240,15 +240,10 @@ class RodLinearSolve:
         if rate:
             self.direct(solved, last, rate, coefficient, rhs, w, resisted)
             return
-        more = resisted[0].matrix(*resisted[1:], rate) if resisted else None
-        self._on_host(solved, last, rate, coefficient, rhs, w, more)
-
-    def _on_host(self, solved, last, rate: float, coefficient: float, rhs: wp.array, w: wp.array, more) -> None:
         data = SimpleNamespace(x=solved.x, theta=solved.theta, frame=solved.frame, last=last)
         groups = [data if each is self.group else None for each in self.model.groups]
-        factor = None if rate else solved.time
         b = device_arrays.download(rhs).astype(float).transpose(2, 1, 0).ravel()
-        solution = self.host(SimpleNamespace(groups=groups), rate, coefficient, factor, b, more)
+        solution = self.host(SimpleNamespace(groups=groups), rate, coefficient, solved.time, b)
         device_arrays.assign(w, self.tangent.blocks(solution).transpose(2, 1, 0))
         by_fixed = self.host.held
         self.held = None if by_fixed is None else self.tangent.blocks(by_fixed).transpose(2, 1, 0)

@@ -1,6 +1,6 @@
 """Predictor of rod groups in the backward pass: recomputed for terms lagged at the predicted configuration, with a VJP.
 
-Follower loads are evaluated on the predicted configuration; in the midpoint rule frames and drag are, too.
+Follower loads are evaluated on the predicted configuration; in the midpoint rule frames and quadratic potentials are, too.
 """
 
 import warp as wp

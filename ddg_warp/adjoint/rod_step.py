@@ -6,8 +6,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import device_arrays
-from ddg_warp.adjoint.drag import RodDragAdjoint
-from ddg_warp.adjoint.follower_loads import Followers
+from ddg_warp.adjoint.forces import ForceCotangents, force_adjoints, quadratic_of
 from ddg_warp.adjoint.linear_solve import RodLinearSolve
 from ddg_warp.adjoint.rod_predictor import RodPredictor
 from ddg_warp.adjoint.supports import Supports
@@ -111,8 +110,8 @@ class RodStepAdjoint:
         self.solve = RodLinearSolve(model, group)
         self.supports = Supports(model, group, midpoint) if (scheme or posed) and group.host.moves else None
         motion = self.supports.motion if self.supports else None
-        self.drag = RodDragAdjoint(model, group, midpoint) if kind.quadratic and scheme else None
-        self.followers = Followers(model, group, midpoint) if group.host.followers and scheme else None
+        self.forces = force_adjoints(model, group, midpoint) if scheme else []
+        self._quadratic = quadratic_of(self.forces)
         self.predictor = RodPredictor.of(model, group, motion, scheme)
         terms = range(len(kind.terms))
         storage, viscous = rod_storage(kind, real), kind.viscous
@@ -122,7 +121,7 @@ class RodStepAdjoint:
         of_end = accelerations | {"v", "omega"} | (set() if kind.viscous else {"frame", "last"})
         self.unread = accelerations, of_end, accelerations
         # these add their contributions before the end update
-        between = (self.supports, self.drag, self.followers, self.predictor)
+        between = (self.supports, *self.forces, self.predictor)
         self._complete = scheme is not None and not any(between)
         self._vjp = elements.pull_kernel(storage, real, False, viscous, not self._complete)
         self._windows = elements.window_kernel(storage, real) if self._complete else None
@@ -156,7 +155,7 @@ class RodStepAdjoint:
             rate=self._make(),
             damping=self._make(),
             gravity=self._make(self.vector),
-            drag=self.drag.by_coefficients if self.drag else None,
+            drag=self._quadratic.by_coefficients if self._quadratic else None,
         )
 
     def suit(self, step, s: float) -> bool:
@@ -164,8 +163,8 @@ class RodStepAdjoint:
         return self.predictor is not None and self.predictor.suit(step, s)
 
     def upload(self, t0: float, t1: float) -> None:
-        """Upload supports, follower loads and flow between t0 and t1, the step to reverse."""
-        for part in filter(None, (self.supports, self.followers, self.drag and self.drag.drag)):
+        """Upload supports and forces between t0 and t1, the step to reverse."""
+        for part in filter(None, (self.supports, *(adjoint.force for adjoint in self.forces))):
             part.upload(t0, t1)
 
     def lagged(self, before: RodGroupState, states=None) -> wp.array:
@@ -225,7 +224,7 @@ class RodStepAdjoint:
         masses = [group.mass, group.rotary, None]
         read = [end, after.x, kept.frame, by_frame, window, group.fixed, self._leaves, *masses, group.count, self._rate]
         self._launch(self._end, read, [lagged, cotangents.end, by_solution, cotangents.rhs])
-        resisted = self.drag and (self.drag, before, tangents)
+        resisted = self._quadratic and (self._quadratic, before, tangents)
         self.solve(kept, before.last, s, cotangents.rhs, inputs.load, resisted)
         if kind.viscous:
             device_arrays.clear(inputs.rate)
@@ -247,13 +246,10 @@ class RodStepAdjoint:
             force = by_solution[: kind.dim], by_solution[kind.dim]
             self.supports.follow(*states)
             self.supports.vjp(kept.x, kept.frame, *force, lagged)
-        if self.drag:
-            by_tangents = predictor.by_x if self._midpoint else None
-            read = before, tangents, kept, inputs.load, self._rate, by_solution, start, inputs.rate
-            self.drag.vjp(*read, by_tangents)
-        if self.followers:
-            w = inputs.load[: kind.dim], inputs.load[kind.dim] if kind.twist else None
-            self.followers.vjp(predictor.x, *w, predictor.by_x[: kind.dim])
+        read = before, predictor and predictor.x, kept, inputs.load, self._rate
+        written = by_solution, start, inputs.rate, predictor and predictor.by_x
+        for force in self.forces:
+            force.vjp(ForceCotangents(*read, *written))
         if predictor:
             predictor.vjp(before, self._nodes, window, by_solution, start, inputs.rate)
         read = [*solution, by_solution, self._leaves, *masses, group.count, group.nodes, self._rate]
@@ -271,7 +267,7 @@ class RodStepAdjoint:
         result = [self._vjp, *self._strain, self._end, self._start, *self.solve.kernels]
         result += [self._windows] if self._complete else [self._nodes, self._update]
         result += [self._edges] if self._strain else []
-        parts = (self.supports, self.drag, self.followers, self.predictor)
+        parts = (self.supports, *self.forces, self.predictor)
         return result + [kernel for part in parts if part for kernel in part.kernels]
 
     def _rows(self, rows: int, needed: bool = True) -> wp.array:

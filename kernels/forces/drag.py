@@ -16,16 +16,15 @@ at a node, such as a ball, adds c I to D. The potential is assembled with inerti
 rotary inertia make one, about a mean target.
 
 Why not shared by rods and the coupled system: `resist` reads the two edges of a node, or a list of edges. A rod adds drag on angles to
-its rotary inertia, while angles of the coupled system have a resistance. One kernel `settle` would take as many lines as two.
+its rotary inertia, while angles of the coupled system have a resistance.
 """
 
 from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.inertia import block_inertia
-from ddg_warp.kernels.core.islands import INERTIA_COEFFICIENT, INVERSE_STEP, LOAD_SCALE, STATUS, STEP_PROGRESS
+from ddg_warp.kernels.core.islands import INERTIA_COEFFICIENT, INVERSE_STEP, LOAD_SCALE, STEP_PROGRESS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
 from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions, inertia_type
 from ddg_warp.kernels.residual.rod_residual import node_functions
@@ -64,12 +63,8 @@ def edge_function(dim: int, real):
 
 
 @cache
-def rod_kernels(kind: RodKind, real):
-    """Build the kernels of drag on uncoupled rods.
-
-    `resist`: write inertia and drag of every node at the start of a solve.
-    `settle`: write rates of massless dofs after a solve.
-    """
+def rod_kernel(kind: RodKind, real):
+    """Build the kernel `resist` of uncoupled rods: write the inertia of every node with drag, at the start of a solve."""
     dim, twist, closed = kind.dim, kind.twist, kind.closed
     V, M, P = wp.types.vector(dim, real), wp.types.matrix((dim, dim), real), wp.types.vector(ROWS, real)
     Inertia = inertia_type(kind, real)
@@ -152,63 +147,12 @@ def rod_kernels(kind: RodKind, real):
                     target_angle[k, r] = target + (theta0[k, r] - target) * (drag_mass / total)
             inertia_out[k, r] = node
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def settle(
-        x: wp.array2d(dtype=V),
-        theta: wp.array2d(dtype=real),
-        mass: wp.array2d(dtype=real),
-        rotary: wp.array2d(dtype=real),
-        count: wp.array(dtype=int),
-        flags: wp.array2d(dtype=int),
-        scalars: wp.array2d(dtype=real),
-        x_end: wp.array2d(dtype=V),
-        theta_end: wp.array2d(dtype=real),
-        v0: wp.array2d(dtype=V),
-        omega0: wp.array2d(dtype=real),
-        v_out: wp.array2d(dtype=V),
-        omega_out: wp.array2d(dtype=real),
-        a_out: wp.array2d(dtype=V),
-        alpha_out: wp.array2d(dtype=real),
-    ):
-        """Write mean rates over the step of massless dofs, which the midpoint rule would keep oscillating.
-
-        Accelerations are changes of means over the step, zero without motion before. The midpoint rule has written v = 2 mean - v0.
-        """
-        start, r = wp.tid()
-        n = count[r]
-        if (
-            start >= n
-            or scalars[STEP_PROGRESS, r] >= real(1.0)
-            or flags[STATUS, r] > wp.static(outcome.CONVERGED_TO_ROUNDING)
-        ):
-            return
-        for k in range(start, until(start, n)):
-            if mass[k, r] <= real(0.0):
-                mean = (x_end[k, r] - x[k, r]) * scalars[INVERSE_STEP, r]
-                a = V()
-                if wp.length_sq(v0[k, r]) > real(0.0):
-                    a = (v_out[k, r] - mean) * (real(0.5) * scalars[INVERSE_STEP, r])
-                a_out[k, r] = a
-                v_out[k, r] = mean
-            if wp.static(twist):
-                if rotary[k, r] <= real(0.0):
-                    spin = (theta_end[k, r] - theta[k, r]) * scalars[INVERSE_STEP, r]
-                    alpha = real(0.0)
-                    if omega0[k, r] != real(0.0):
-                        alpha = (omega_out[k, r] - spin) * real(0.5) * scalars[INVERSE_STEP, r]
-                    alpha_out[k, r] = alpha
-                    omega_out[k, r] = spin
-
-    return resist, settle
+    return resist
 
 
 @cache
-def coupled_kernels(real):
-    """Build the kernels of drag on the coupled system.
-
-    `resist`: write inertia and drag of every dof block at the start of a solve.
-    `settle`: write rates of massless dofs after a solve.
-    """
+def coupled_kernel(real):
+    """Build the kernel `resist` of the coupled system: write the inertia of every block with drag, at the start of a solve."""
     V, M, P = wp.types.vector(3, real), wp.types.matrix((3, 3), real), wp.types.vector(ROWS, real)
     Inertia = block_inertia(real)
     half = edge_function(3, real)
@@ -270,35 +214,4 @@ def coupled_kernels(real):
             moved = wp.length(q[i] - q0[i]) + wp.length(u) / rate
             wp.atomic_max(scalars, LOAD_SCALE, w, real(nodes) * moved * wp.max(wp.get_diag(block.stiffness)))
 
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def settle(
-        q: wp.array(dtype=V),
-        inertia: wp.array2d(dtype=Inertia),
-        flags: wp.array2d(dtype=int),
-        scalars: wp.array2d(dtype=real),
-        blocks: int,
-        q_end: wp.array(dtype=V),
-        v0: wp.array(dtype=V),
-        v_out: wp.array(dtype=V),
-        a_out: wp.array(dtype=V),
-    ):
-        """Write rates of massless dofs with drag; see `rod_kernels`."""
-        i = wp.tid()
-        w = i / blocks
-        if scalars[STEP_PROGRESS, w] >= real(1.0) or flags[STATUS, w] > wp.static(outcome.CONVERGED_TO_ROUNDING):
-            return
-        block = inertia[w, i - w * blocks]
-        v = v_out[i]
-        mean = (q_end[i] - q[i]) * scalars[INVERSE_STEP, w]
-        change = (v - mean) * (real(0.5) * scalars[INVERSE_STEP, w])
-        moved = wp.length_sq(v0[i]) > real(0.0)
-        a = V()
-        for d in range(3):
-            if block.mass[d] <= real(0.0) and block.stiffness[d, d] > real(0.0):
-                v[d] = mean[d]
-                if moved:
-                    a[d] = change[d]
-        v_out[i] = v
-        a_out[i] = a
-
-    return resist, settle
+    return resist

@@ -19,6 +19,7 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.core import outcome
+from ddg_warp.kernels.core.inertia import block_inertia, node_inertia
 from ddg_warp.kernels.core.islands import (
     COLD_START,
     FAILURE_STATUS,
@@ -38,7 +39,7 @@ from ddg_warp.kernels.core.islands import (
     attempt_functions,
 )
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.core.nodes import NodeStorage, dof_functions, state_type
+from ddg_warp.kernels.core.nodes import NodeStorage, dof_functions, mass_functions, state_type
 from ddg_warp.kernels.stepping.warm_start import extrapolation_rate_function
 
 
@@ -149,10 +150,13 @@ def start_kernel(real):
 
 
 @cache
-def finish_kernel(nodes: NodeStorage, real, midpoint: bool, contact: bool = False):
+def finish_kernel(nodes: NodeStorage, real, midpoint: bool, quadratic: bool, contact: bool = False):
     """Build the kernel of the end update.
 
     `finish`: write positions, twist angles, velocities and accelerations at the end of the substep of islands that converged.
+
+    The midpoint rule would keep rates of massless dofs oscillating. With a quadratic potential these dofs have mean rates over the
+    step. Their accelerations are changes of means, zero without motion before.
 
     In the coupled system `trust` scales accelerations, and the rate of inertia in contact is stored if `rate_out` has entries.
     `contact`: see `extrapolation_rate_function`.
@@ -160,6 +164,16 @@ def finish_kernel(nodes: NodeStorage, real, midpoint: bool, contact: bool = Fals
     coupled, extrapolation_of = nodes.coupled, extrapolation_rate_function(real, midpoint, contact)
     V, B, State = wp.types.vector(nodes.dim, real), wp.types.vector(nodes.block, real), state_type(nodes, real)
     (dofs, store), (items, until) = dof_functions(nodes, real), nodes.thread_functions
+    (masses, _), Mass, dim, block = mass_functions(nodes, real), nodes.mass_type(real), nodes.dim, nodes.block
+    Inertia = block_inertia(real) if coupled else node_inertia(dim, real)
+
+    @wp.func
+    def is_settled(m: B, inertia: wp.array2d(dtype=Inertia), k: int, island: int, d: int):
+        """Return True if a dof has no mass; in the coupled system only if the potential holds it."""
+        result = m[d] <= real(0.0)
+        if wp.static(coupled):
+            result = result and inertia[k, island].stiffness[d, d] > real(0.0)
+        return result
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def finish(
@@ -172,6 +186,9 @@ def finish_kernel(nodes: NodeStorage, real, midpoint: bool, contact: bool = Fals
         predicted_angle: wp.array2d(dtype=real),
         trust: wp.array(dtype=real),
         rate: wp.array(dtype=real),
+        mass: wp.array2d(dtype=Mass),
+        rotary: wp.array2d(dtype=real),
+        inertia: wp.array2d(dtype=Inertia),
         count: wp.array(dtype=int),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
@@ -206,8 +223,21 @@ def finish_kernel(nodes: NodeStorage, real, midpoint: bool, contact: bool = Fals
                 a = (end - dofs(predicted, predicted_angle, k, island)) * extrapolation
                 v = (end - start) * scalars[INVERSE_STEP, island]
                 if wp.static(midpoint):
+                    solution = end
+                    v0 = dofs(before.v, before.omega, k, island)
                     end = real(2.0) * end - start
-                    v = real(2.0) * v - dofs(before.v, before.omega, k, island)
+                    v = real(2.0) * v - v0
+                    if wp.static(quadratic):
+                        mean = (end - solution) * scalars[INVERSE_STEP, island]
+                        change = (v - mean) * (real(0.5) * scalars[INVERSE_STEP, island])
+                        m = masses(mass, rotary, k, island)
+                        moved = wp.length_sq(before.v[k, island]) > real(0.0)
+                        for d in range(wp.static(block)):
+                            if is_settled(m, inertia, k, island, d):
+                                if d >= wp.static(dim):
+                                    moved = v0[d] != real(0.0)
+                                v[d] = mean[d]
+                                a[d] = wp.where(moved, change[d], real(0.0))
             else:
                 v = dofs(before.v, before.omega, k, island)
                 a = dofs(a0, alpha0, k, island)

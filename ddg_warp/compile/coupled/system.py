@@ -185,6 +185,11 @@ class CoupledSystem(DofStorage):
                 return f"edge {int(np.argmax(rod.all_edges == place)) - rod.first} of rod {rod.rod}"
         return "the point at ({:g}, {:g}, {:g}) m".format(*self.rest[place])
 
+    @property
+    def quadratic(self) -> bool:
+        """True if nodes have a quadratic potential; see `kernels.core.inertia`."""
+        return any(rod.piece.kind.quadratic for rod in self.rods)
+
     @cached_property
     def drag(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """(nodes (2, E), angle block or -1 (E,), coefficients (rows, E)) of edges with drag; None without any."""

@@ -92,7 +92,7 @@ class ControlledLoads(Loads):
         if len(amplitudes) > 1:
             self._shared.assign((self._dead @ amplitudes).reshape(-1, 3))
 
-    def give(self) -> None:
+    def begin(self) -> None:
         """Add the control loads of the step and update the load scales; capturable."""
         values = self._values.reshape(self._sizes.shape)
         device = self.model.wp_device

@@ -9,22 +9,24 @@ from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.elements import rod_layout
 from ddg_warp.kernels.forces import drag
 from ddg_warp.scene.drag import flow_at
+from ddg_warp.solve.forces.force import Force
 from ddg_warp.solve.linear.sparse_system import lists
 
 
-class Drag:
+class Drag(Force):
     """Drag on a `RodGroup` or `CoupledModel`."""
 
-    def __init__(self, model, part, kernels: tuple, midpoint: bool):
-        self.model, self.part, self.midpoint = model, part, midpoint
-        self._resist, self._settle = kernels
+    name = "drag"
+
+    def __init__(self, model, part, kernel, midpoint: bool):
+        self.model, self.part, self.midpoint, self._resist = model, part, midpoint, kernel
         vector = wp.types.vector(part.dim, model.types.real)
         self.flow = wp.array(self._flow(0.0), dtype=vector, device=model.wp_device)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [self._resist, *([self._settle] if self.midpoint else [])]
+        return [self._resist]
 
     def upload(self, t0: float, t1: float) -> None:
         """Upload the flow at the evaluation time of the scheme."""
@@ -49,7 +51,12 @@ class RodGroupDrag(Drag):
     """Drag on a rod group in a flowing fluid."""
 
     def __init__(self, model, group, midpoint: bool = False):
-        super().__init__(model, group, drag.rod_kernels(group.kind, model.types.real), midpoint)
+        super().__init__(model, group, drag.rod_kernel(group.kind, model.types.real), midpoint)
+
+    def freeze(self, before, newton) -> None:
+        """Write inertia and target angles; see `Force`."""
+        iterates, loading = newton.iterates, newton.loading
+        self.resist(before, iterates.x, loading.mass, loading.rotary, iterates.target_angle, newton.islands)
 
     def resist(self, before, x: wp.array, mass: wp.array, rotary: wp.array, target_angle: wp.array, islands) -> None:
         """Write inertia and drag, with target angles, of a solve from the state `before`, given the predictor x."""
@@ -70,18 +77,6 @@ class RodGroupDrag(Drag):
         self.resist(data, data.x, mass, wp.zeros_like(data.theta), wp.clone(data.theta), self._over_a_second())
         return device_arrays.download(mass), self.flow.numpy()[0].astype(float)
 
-    def settle(self, before, after, iterates, islands) -> None:
-        """Write the rates of massless dofs of the state `after`, which may be `before` itself."""
-        group = self.part
-        if self.midpoint:
-            self._launch(
-                self._settle,
-                group.node_threads,
-                [iterates.x, iterates.theta, group.mass, group.rotary, group.count, *islands.arrays]
-                + [after.x, after.theta, before.v, before.omega],
-                [after.v, after.omega, after.a, after.alpha],
-            )
-
     def rates(self, data, lead: float) -> tuple[np.ndarray, np.ndarray]:
         """Return rates of nodes and edges (node, column), of massless dofs extrapolated by `lead` [s]."""
         v, a, omega, alpha, mass, rotary = (
@@ -100,7 +95,7 @@ class CoupledDrag(Drag):
 
     def __init__(self, model, midpoint: bool = False):
         coupled, host, device = model.coupled, model.coupled.host, model.wp_device
-        super().__init__(model, coupled, drag.coupled_kernels(model.types.real), midpoint)
+        super().__init__(model, coupled, drag.coupled_kernel(model.types.real), midpoint)
         ends, angles, _ = host.drag
         places = np.stack([*ends, np.where(angles < 0, host.blocks, angles)], -1).ravel()
         starts, items = lists(places, host.blocks + 1)
@@ -108,6 +103,10 @@ class CoupledDrag(Drag):
         self.ends, self.starts, self.items = (
             wp.array(np.ascontiguousarray(v, np.int32), dtype=int, device=device) for v in (ends.T, starts, items // 3)
         )
+
+    def freeze(self, before, newton) -> None:
+        """Write inertia; see `Force`."""
+        self.resist(before, newton.iterates.q, newton.loading.mass, newton.loading.scale, newton.islands)
 
     def resist(self, before, q: wp.array, mass: wp.array, load_scale: wp.array, islands) -> None:
         """Write inertia and drag `mass` of a solve from the state `before`, given the predictor q."""
@@ -136,10 +135,3 @@ class CoupledDrag(Drag):
         coupled = self.part
         v, a = (array.numpy().astype(float).reshape(coupled.worlds, -1, 3) for array in (state.v, state.a))
         return v + lead * np.where((coupled.mass.numpy() <= 0.0) & (v != 0.0), a, 0.0) if lead > 0.0 else v
-
-    def settle(self, before, after, q: wp.array, mass: wp.array, islands) -> None:
-        """Write the rates of massless dofs of the state `after`, which may be `before` itself."""
-        coupled = self.part
-        if self.midpoint:
-            inputs = [q, mass, *islands.arrays, coupled.blocks, after.q, before.v]
-            self._launch(self._settle, coupled.worlds * coupled.blocks, inputs, [after.v, after.a])

@@ -5,15 +5,18 @@ import warp as wp
 from scipy import sparse
 
 from ddg_warp.kernels.forces.follower_loads import follower_kernel, spread_kernel
+from ddg_warp.solve.forces.force import Force
 
 
-class Loads:
+class Loads(Force):
     """Loads in time and follower loads of a rod group or of the coupled system.
 
     Args:
         part: `RodGroup` or `CoupledModel`.
         midpoint: True if the scheme evaluates forces at the middle of a step.
     """
+
+    name = "loads"
 
     def __init__(self, model, part, midpoint: bool):
         host, real, device = part.host, model.types.real, model.wp_device
@@ -22,7 +25,7 @@ class Loads:
         self.places = self._touched(following)
         self._dead = self._matrix([host.constant, *host.timed])
         self._values = wp.zeros(self._copies * len(self.places), dtype=self._vector, device=device)
-        self.total = len(following)
+        self.total, self.follows = len(following), bool(host.followers)
         self._force = wp.zeros(max(1, part.worlds * self.total), dtype=self._vector, device=device)
 
         def put(values):
@@ -85,6 +88,10 @@ class Loads:
     def _upload_dead(self, amplitudes: list[float]) -> None:
         """Upload dead loads by amplitudes: constant loads, then each load in time."""
         self._values.assign((self._dead @ amplitudes).reshape(-1, 3))
+
+    def freeze(self, before, newton) -> None:
+        """Write the loads at the predictor; see `Force`."""
+        self.apply(*newton.node_loads)
 
     def apply(self, x: wp.array, force: wp.array, moment: wp.array) -> None:
         """Write the loads on nodes at positions x, and on angles."""

@@ -196,6 +196,12 @@ class CoupledNewton:
         return self.frozen or self.islands
 
     @property
+    def node_loads(self) -> tuple[wp.array, wp.array, wp.array]:
+        """Dof blocks of the iterate, forces on them and moments about angles [block][world]."""
+        coupled, force = self.coupled, self.loading.force
+        return coupled.points(self.iterates.q), coupled.points(force), coupled.angles(force)
+
+    @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         parts = (self.residual, self.tolerances, self.line_search, self._worst, self.elements, self._assembly)

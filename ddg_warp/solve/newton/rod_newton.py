@@ -186,6 +186,11 @@ class RodNewton:
         """Return zero: the sweep is direct."""
         return 0
 
+    @property
+    def node_loads(self) -> tuple[wp.array, wp.array, wp.array]:
+        """Nodes of the iterate, forces on them and moments about edges [node][column]."""
+        return self.iterates.x, self.loading.force, self.loading.moment
+
     def take_loads(self) -> None:
         """Allocate loads on all nodes and angles, in place of the group's constant ones."""
         x, theta = self.iterates.x, self.iterates.theta

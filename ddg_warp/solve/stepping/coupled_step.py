@@ -21,8 +21,7 @@ from ddg_warp.scene import drag
 from ddg_warp.solve.collision.support_arcs import Arcs
 from ddg_warp.solve.equilibrium.tangent import Tangent
 from ddg_warp.solve.forces.control_loads import ControlledLoads, CoupledScale
-from ddg_warp.solve.forces.drag import CoupledDrag
-from ddg_warp.solve.forces.loads import Loads
+from ddg_warp.solve.forces.force_list import forces_of
 from ddg_warp.solve.forces.prescribed_element_data import CoupledField, CoupledMotion
 from ddg_warp.solve.linear.solver_selection import coupled_preconditioner
 from ddg_warp.solve.newton.coupled_newton import PRECONDITIONERS, CoupledNewton
@@ -67,9 +66,7 @@ class CoupledStep(StepDriver):
         reuse = integrator.solver == "projective"
         if options.psd == "auto" and means.stiff and not reuse:
             options = replace(options, psd="progressive")
-        solver = CoupledNewton(
-            model, options, preconditioner, means.linear, host.drag is not None, reuse, means.mixed_axial
-        )
+        solver = CoupledNewton(model, options, preconditioner, means.linear, host.quadratic, reuse, means.mixed_axial)
         super().__init__(integrator, model, solver, means, counts_of)
         self.contact = solver.contact
         if counts_of is not None:
@@ -83,23 +80,23 @@ class CoupledStep(StepDriver):
         self._counts = [*self.islands.arrays, self.tally, self.work, self.newton.pcg_work]
         self._kept = [wp.zeros_like(array) for array in self._counts] if solver.contact else []
         self._foresight = WarmStart(solver)
-        nodes = model.coupled.nodes
+        nodes, quadratic = model.coupled.nodes, host.quadratic
+        self.inertia = solver.loading.mass.transpose((1, 0)) if quadratic else None
         self._begin = time_step.begin_kernel(nodes, real, self.midpoint)
-        self._finish = time_step.finish_kernel(nodes, real, self.midpoint, solver.contact is not None)
+        self._finish = time_step.finish_kernel(nodes, real, self.midpoint, quadratic, solver.contact is not None)
         if solver.contact and self.midpoint:
             raise SceneError(
                 "contact: by the midpoint rule steps overshoot equilibrium and end in overlaps; use 'implicit_euler'"
             )
         self._lagged = model.coupled.lagged() if model.coupled.edges else None
         self._take = coupled_frames.take_kernel(real)
-        self.drag = CoupledDrag(model, self.midpoint) if host.drag else None
-        self.energy = CoupledEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.motion = CoupledMotion(model, self.midpoint) if host.moves else None
+        loads = None
         if (controls := integrator.given) is not None:
             scale = CoupledScale(model, self.coupled, solver)
-            self.loads = ControlledLoads(model, self.coupled, self.midpoint, controls, scale)
-        elif host.timed or host.followers:
-            self.loads = Loads(model, self.coupled, self.midpoint)
+            loads = ControlledLoads(model, self.coupled, self.midpoint, controls, scale)
+        self.forces = forces_of(model, self.coupled, self.midpoint, loads)
+        self.energy = CoupledEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.arcs = self._resolve_arcs()
         self.field = CoupledField(model, self.midpoint, integrator.field)
         self._data = (self.motion.data if self.motion else {}) | self.field.data
@@ -267,14 +264,6 @@ class CoupledStep(StepDriver):
             self.motion.direct(islands, iterates.q, start.frame)
         return start
 
-    def apply_loads(self, before) -> None:
-        """Launch the loads in time, and drag."""
-        coupled, q, loading = self.coupled, self.newton.iterates.q, self.newton.loading
-        if self.loads:
-            self.loads.apply(coupled.points(q), coupled.points(loading.force), coupled.angles(loading.force))
-        if self.drag:
-            self.drag.resist(before, q, loading.mass, loading.scale, self.islands)
-
     def warm_start(self, before) -> None:
         """Warm-start from the predictor by the last correction, and store the start."""
         self._foresight.start(before)
@@ -292,13 +281,12 @@ class CoupledStep(StepDriver):
             self._finish,
             coupled.node_threads,
             [points(q), None, coupled.node_state(before), points(before.a), None]
-            + [points(self._foresight.predicted), None, self._foresight.trust, rate, coupled.count]
+            + [points(self._foresight.predicted), None, self._foresight.trust, rate]
+            + [coupled.mass.transpose((1, 0)), None, self.inertia, coupled.count]
             + self.islands.arrays,
             [coupled.node_state(after), points(after.a), None, after.rate],
             device=self.model.wp_device,
         )
-        if self.drag:
-            self.drag.settle(before, after, q, self.newton.loading.mass, self.islands)
 
     def complete(self, start, before, after) -> None:
         """Update frames, magnetic field and strains to the positions."""

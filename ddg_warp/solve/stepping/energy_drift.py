@@ -102,8 +102,8 @@ class RodEnergy(_Energy):
         self.ranges = 1 if group.kind.serial else max(1, math.isqrt(group.nodes))
         super().__init__(step, group.columns, 2 * self.ranges, kept)
         self._loads = [newton.loading.force, newton.loading.moment]
-        self._follows = bool(group.host.followers)
-        if self._follows:
+        self._following = [force for force in step.forces if force.follows]
+        if self._following:
             self._loads = [wp.clone(load) for load in self._loads]
         real = self.model.types.real
         self._elements = [energy_drift.element_kernel(rod_storage(group.kind, real), real, newton.linear)]
@@ -114,8 +114,8 @@ class RodEnergy(_Energy):
         """Test the energy drift of the step from the state `before`, with the lagged data of `start`."""
         step, group, newton = self.step, self.step.group, self.step.newton
         iterates, loading = newton.iterates, newton.loading
-        if self._follows:
-            step.loads.apply(iterates.x, *self._loads)
+        for force in self._following:
+            force.apply(iterates.x, *self._loads)
         grid, common = (self.ranges, group.columns), [self.rounding_factor, self.ranges]
         scalars = step.islands.arrays[1]
         states = [group.element_inputs(state, start.last, step.islands.inverse_step) for state in (before, iterates)]
@@ -123,12 +123,12 @@ class RodEnergy(_Energy):
         self._launch(self._elements[0], grid, read, [self.rows[:, : self.ranges]])
         read = [group.node_state(before), iterates.x, iterates.theta, group.mass, group.rotary]
         read += [
-            loading.mass if group.kind.quadratic else None,
+            step.inertia,
             group.count,
             *self._loads,
             loading.force,
             loading.moment,
-            int(self._follows),
+            int(bool(self._following)),
         ]
         self._launch(self._nodes, grid, [*read, scalars, step.damping, *common], [self.rows[:, self.ranges :]])
         self._enter()
@@ -149,8 +149,9 @@ class CoupledEnergy(_Energy):
         storages = [coupled_storage(part.term, real) for part in coupled.sets]
         self._elements = [energy_drift.element_kernel(storage, real, step.newton.linear) for storage in storages]
         force = step.newton.loading.force
-        self._load = wp.clone(force) if coupled.host.followers else force
-        self._nodes = energy_drift.node_kernel(coupled.nodes, real, step.drag is not None)
+        self._following = [each for each in step.forces if each.follows]
+        self._load = wp.clone(force) if self._following else force
+        self._nodes = energy_drift.node_kernel(coupled.nodes, real, step.inertia is not None)
 
     @property
     def kernels(self) -> list:
@@ -167,12 +168,11 @@ class CoupledEnergy(_Energy):
             states = [coupled.elements(middle, i, blocks, step.islands.inverse_step) for blocks in (before.q, q)]
             read = [*states, data["stiffness"], scalars, self.rounding_factor, part.elements]
             self._launch(kernel, (coupled.worlds, part.elements), read, [self._rows[i]])
-        follows = bool(coupled.host.followers)
-        if follows:
-            step.loads.apply(points(q), points(self._load), coupled.angles(self._load))
+        for force in self._following:
+            force.apply(points(q), points(self._load), coupled.angles(self._load))
         read = [coupled.node_state(before), points(q), None, coupled.mass.transpose((1, 0)), None]
-        read += [loading.mass.transpose((1, 0)) if step.drag else None, coupled.count]
-        read += [points(self._load), None, points(loading.force), None, int(follows)]
+        read += [step.inertia, coupled.count]
+        read += [points(self._load), None, points(loading.force), None, int(bool(self._following))]
         read += [scalars, step.damping, self.rounding_factor, coupled.blocks]
         self._launch(self._nodes, (coupled.worlds, coupled.blocks), read, [self._rows[-1]])
         for add, values, out in zip(self._add, self._values, self._out, strict=True):

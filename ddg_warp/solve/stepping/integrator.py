@@ -494,8 +494,8 @@ class Integrator:
         for part in self._parts:
             if part.motion:
                 part.motion.follow(before, after)
-            if self.given is not None:
-                part.loads.give()
+            for force in part.forces:
+                force.begin()
         start = self._gyroscope.begin(before, self._rod_steps, self._coupled) if self._spinning else before
         for rod_step in self._rod_steps:
             with timer("rod group"):

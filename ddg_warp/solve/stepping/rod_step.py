@@ -11,8 +11,7 @@ from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.rod_layout import rod_storage
 from ddg_warp.kernels.stepping import rod_step, time_step, warm_start
 from ddg_warp.solve.forces.control_loads import ControlledLoads, RodScale
-from ddg_warp.solve.forces.drag import RodGroupDrag
-from ddg_warp.solve.forces.loads import Loads
+from ddg_warp.solve.forces.force_list import forces_of
 from ddg_warp.solve.forces.prescribed_motion import Motion
 from ddg_warp.solve.linear.solver_selection import automatic
 from ddg_warp.solve.newton.coupled_newton import PRECONDITIONERS
@@ -43,18 +42,17 @@ class RodStep(StepDriver):
         self._predicted, self._predicted_angle = (
             device_arrays.allocate(array.shape, array.dtype, model.wp_device) for array in (x, theta)
         )
-        self._nodes = time_step.finish_kernel(kind.nodes, real, self.midpoint)
+        self._nodes = time_step.finish_kernel(kind.nodes, real, self.midpoint, kind.quadratic)
         self._frames = rod_step.finish_frames_kernel(kind, real) if kind.twist else None
-        self.outer = group.outer
+        self.outer, loads = group.outer, None
+        self.inertia = self.newton.loading.mass if kind.quadratic else None
         if (controls := integrator.given) is not None:
             self.newton.take_loads()
             scale = RodScale(model, group)
-            self.outer, self.loads = scale.load, ControlledLoads(model, group, self.midpoint, controls, scale)
-        elif group.host.timed or group.host.followers:
-            self.loads = Loads(model, group, self.midpoint)
+            self.outer, loads = scale.load, ControlledLoads(model, group, self.midpoint, controls, scale)
+        self.forces = forces_of(model, group, self.midpoint, loads)
         self.energy = energy_drift.RodEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.motion = Motion(model, group, self.midpoint) if group.host.moves else None
-        self.drag = RodGroupDrag(model, group, self.midpoint) if kind.quadratic else None
 
     @property
     def index(self) -> int:
@@ -77,15 +75,6 @@ class RodStep(StepDriver):
         if self.motion:
             self.motion.direct(self.islands, iterates.x, iterates.frame, iterates.theta)
         return before
-
-    def apply_loads(self, before) -> None:
-        """Launch the loads in time, and drag."""
-        iterates, loading = self.newton.iterates, self.newton.loading
-        if self.loads:
-            self.loads.apply(iterates.x, loading.force, loading.moment)
-        if self.drag:
-            outputs = loading.mass, loading.rotary, iterates.target_angle
-            self.drag.resist(before, iterates.x, *outputs, self.islands)
 
     def warm_start(self, before) -> None:
         """Warm-start from the predictor by the last correction, and store the start."""
@@ -110,11 +99,10 @@ class RodStep(StepDriver):
             self._nodes,
             group.node_threads,
             [iterates.x, iterates.theta, group.node_state(before), before.a, before.alpha]
-            + [self._predicted, self._predicted_angle, None, None, group.count, *self.islands.arrays],
+            + [self._predicted, self._predicted_angle, None, None, group.mass, group.rotary, self.inertia]
+            + [group.count, *self.islands.arrays],
             [group.node_state(after), after.a, after.alpha, None],
         )
-        if self.drag:
-            self.drag.settle(before, after, iterates, self.islands)
 
     def complete(self, start, before, after) -> None:
         """Update frames and strains to the positions."""

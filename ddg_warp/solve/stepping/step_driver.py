@@ -1,6 +1,7 @@
 """Time stepper of a rod group or of the coupled system: the algorithm of a step, retries, outcomes."""
 
 import warnings
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.core.islands import LEAST, MAX_PROJECTED_ITERATIONS
 from ddg_warp.kernels.newton.line_search import ROUNDED
 from ddg_warp.kernels.stepping import time_step as step
+from ddg_warp.solve.forces.force import Force
 from ddg_warp.solve.forces.prescribed_motion import jump_between
 from ddg_warp.timers import timer
 
@@ -57,7 +59,7 @@ class StepDriver:
     A step is `step`: attempts (`attempt`), each with one solve, until every island has finished the step or failed. An iteration of
     the solve is `RodNewton.iterate` or `CoupledNewton.iterate`.
 
-    Subclasses define the phases of `attempt` (`predict`, `apply_loads`, `warm_start`, `solve`, `finish`, `complete`) and their kernels
+    Subclasses define the phases of `attempt` (`predict`, `warm_start`, `solve`, `finish`, `complete`) and their kernels
     (`own_kernels`). For a failed island they return its label (`island_label`), its rods (`rods_of`) and the location of the failure
     (`where`). `float32_errors` returns the float32 errors of the islands of a world over a solve.
 
@@ -68,13 +70,15 @@ class StepDriver:
         counts_of: replaced stepper, which passes on counters, the rounding outcome and the state of the islands.
 
     Attributes:
-        energy, motion, loads, field, drag, contact: energy watch, motion of supports, loads in time, magnetic field, drag, contact;
-            None without.
+        energy, motion, field, contact: energy watch, motion of supports, magnetic field, contact; None without.
+        forces: forces on nodes, see `Force`.
+        inertia: inertia of nodes with a quadratic potential [node][island]; None without.
         rounded: outcome of solves that end by rounding.
         tally, work: counts of outcomes and of work; see `kernels.stepping.time_step.advance_kernel`.
     """
 
-    energy = motion = loads = field = drag = contact = None
+    energy = motion = field = contact = inertia = None
+    forces: Sequence[Force] = ()
 
     def __init__(self, integrator, model, newton, means: LinearSolverChoice, counts_of: "StepDriver | None" = None):
         self.means = means._replace(linear=newton.linear)
@@ -149,8 +153,8 @@ class StepDriver:
 
     @timer("prescribe")
     def prescribe(self, t0: float, t1: float) -> None:
-        """Upload supports, loads, magnetic field and flow between t0 and t1."""
-        for part in filter(None, (self.motion, self.loads, self.field, self.drag)):
+        """Upload supports, forces and magnetic field between t0 and t1."""
+        for part in filter(None, (self.motion, self.field, *self.forces)):
             part.upload(t0, t1)
 
     def step(self, before, after) -> None:
@@ -185,7 +189,8 @@ class StepDriver:
         with timer("predictor"):  # inertial target, prescribed motion of supports
             start = self.predict(before)
         with timer("loads"):
-            self.apply_loads(before)
+            for force in self.forces:
+                force.freeze(before, newton)
         if not self.midpoint:
             with timer("warm start"):  # the last correction, extrapolated
                 self.warm_start(before)
@@ -213,7 +218,7 @@ class StepDriver:
     def load_modules(self) -> None:
         """Compile and load every kernel before a capture."""
         kernels = [self._start, self._advance, *self.own_kernels, *self.newton.kernels]
-        for part in filter(None, (self.motion, self.loads, self.field, self.drag, self.energy)):
+        for part in filter(None, (self.motion, self.field, *self.forces, self.energy)):
             kernels += part.kernels
         device_arrays.load_kernels(kernels, self.model.wp_device)
 

@@ -367,7 +367,7 @@ class CoupledReactions(_Reactions):
         """Allocate the arrays for a `CoupledStep`, before a capture."""
         newton, host = step.newton, self.part.host
         self._react = support_forces.coupled_reaction_kernel(
-            self._real, newton.linear, host.drag is not None, newton.contact is not None
+            self._real, newton.linear, host.quadratic, newton.contact is not None
         )
         device_arrays.load_kernels([self._react], self._device)
         if self._obstacles:
