@@ -31,6 +31,7 @@ TESTED_BY = {
     "kernels/collision/friction/surface_rotation": ("collision/test_rolling.py", "rolling=True"),
     "kernels/core/division": ("kernels/test_shell_measures.py", "degenerate"),
     "kernels/core/dof_map": ("test_gyroscopic.py", "Integrator"),
+    "kernels/core/inertia": ("test_drag.py", "drag"),
     "kernels/core/nodes": ("test_warm_start.py", "Integrator"),
     "kernels/densities": ("kernels/test_terms.py", "REGISTRY"),
     "kernels/elements": ("kernels/test_terms.py", "REGISTRY"),

@@ -4,11 +4,11 @@
     python tools/bench_calls.py --against FILE [--cuda] [--out DIR] with those of another version, measured just before: a table
 
 Four rods of 12 nodes with a grip each, 0.005 s a step: uncoupled, joined, or with contact. `step`: of an integrator. `set`: with a
-parameter change before each step. `field`: with a natural curvature that is a function of arc length and time. `worlds`: of 1,024
-worlds. `torch`: a step of a `Simulator` without gradients, of 64 worlds. `parameter`, `poses`: with a tensor for every world.
-`forward`, `backward`: of roll-outs of ten steps with both. `error`: relative error of the gradient by the parameter against central
-differences. Times are the least of several runs of consecutive calls, with one device synchronisation at the end. To compare
-versions alternate both on one machine.
+parameter change before each step. `wrenches`: with the wrenches of the step on the device. `field`: with a natural curvature that is
+a function of arc length and time. `worlds`: of 1,024 worlds. `torch`: a step of a `Simulator` without gradients, of 64 worlds.
+`parameter`, `poses`: with a tensor for every world. `forward`, `backward`: of roll-outs of ten steps with both. `error`: relative
+error of the gradient by the parameter against central differences. Times are the least of several runs of consecutive calls, with
+one device synchronisation at the end. To compare versions alternate both on one machine.
 """
 
 import argparse
@@ -86,6 +86,9 @@ def plain(kind: str, model, clock):
         integrator.step(state, DT)
 
     yield {"kind": kind, "call": "set", "ms": clock(change), "error": ""}
+    watched = ddg.Integrator(model)
+    watched.watch_wrenches()
+    yield {"kind": kind, "call": "wrenches", "ms": clock(lambda: watched.step(state, DT)), "error": ""}
     driven = scene_of(kind)
     driven.prescribe(
         "muscle", "rod_bend_twist.rest_1", lambda s, t: 1e-3 * np.sin(s - t), rods=range(4), over="arc_length"

@@ -20,12 +20,15 @@ def solutions(model, state, rate: float):
     nodes = np.arange(group.nodes)[:, None] < np.tile(group.host.count, group.worlds)
     free = ((np.tile(group.host.fixed, (1, group.worlds)) >> dof) & 1 == 0) & nodes
     right = np.where(free, np.random.default_rng(2).normal(size=shape), 0.0)
-    rhs, device, host = (device_arrays.upload(right, model.types.real, model.wp_device) for _ in range(3))
+    rhs, device = (device_arrays.upload(right, model.types.real, model.wp_device) for _ in range(2))
     solved = SimpleNamespace(x=data.x, theta=data.theta, frame=data.frame)
     solve(solved, data.last, 1.0 / rate, rhs, device)
     coefficient = rate * (rate + model.scene.mass_damping)
-    solve._on_host(solved, data.last, rate, coefficient, rhs, host, None)
-    return [np.where(free, device_arrays.download(array), 0.0) for array in (rhs, device, host)], solve
+    on_host = SimpleNamespace(groups=[SimpleNamespace(**vars(solved), last=data.last)])
+    solution = solve.host(on_host, rate, coefficient, None, right.transpose(2, 1, 0).ravel())
+    host = solve.tangent.blocks(solution).transpose(2, 1, 0)
+    values = device_arrays.download(rhs), device_arrays.download(device), host
+    return [np.where(free, array, 0.0) for array in values], solve
 
 
 @pytest.mark.parametrize("name", ["twisted", "clamped_end", "planar", "closed"])
