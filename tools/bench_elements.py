@@ -190,9 +190,9 @@ def main() -> int:
         rows = [
             {"kernel": kernel, "precision": precision}
             | {
-                f"{name}_{when}": found.get((kernel, precision), {}).get(name, "")
+                f"{name}_{when}": rows_of.get((kernel, precision), {}).get(name, "")
                 for name in ("registers", "stack", "code_kb")
-                for when, found in by_kernel.items()
+                for when, rows_of in by_kernel.items()
             }
             for kernel, precision in dict.fromkeys([*by_kernel["before"], *by_kernel["after"]])
         ]
