@@ -426,7 +426,9 @@ def test_coefficients_at_nodes_are_linear_between(device):
     by_node, _ = varied(device, False, tangential=values, normal=2.0 * values, rotational=values)
     middles = 0.5 * (values[1:] + values[:-1])
     by_edge, _ = varied(device, False, tangential=middles, normal=2.0 * middles, rotational=middles)
-    np.testing.assert_array_equal(by_node.groups[0].host.drag, by_edge.groups[0].host.drag)
+    np.testing.assert_array_equal(
+        by_node.groups[0].host.coefficients["drag"], by_edge.groups[0].host.coefficients["drag"]
+    )
 
 
 def test_a_radius_of_every_edge(device):
@@ -435,7 +437,7 @@ def test_a_radius_of_every_edge(device):
     model, _ = varied(device, False, law=ddg.Viscous(2.0, scale=1.0, radius=radius))
     cox = np.log(2.0) - 0.5  # 4 pi mu / (ln(S / a) + ln 2 - 1/2)
     expected = np.tile(4.0 * np.pi * 2.0 / (np.log(1.0 / radius) + cox), (2, 1))
-    np.testing.assert_allclose(model.groups[0].host.drag[1, :6].T, expected, rtol=1e-12)
+    np.testing.assert_allclose(model.groups[0].host.coefficients["drag"][1, :6].T, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("joined", [False, True], ids=["alone", "joined"])

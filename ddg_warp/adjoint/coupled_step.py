@@ -54,7 +54,7 @@ class CoupledInputs:
         mass: by the masses of the dofs of blocks (W N,).
         load: by the forces on them, zero at fixed dofs.
         held: by the prescribed positions of fixed dofs at the solution (W N,).
-        drag: by drag coefficients (rows, W edges with drag); None without drag.
+        coefficients: by coefficients of edges (rows, W edges), by name of the force.
         rate, damping, gravity: by the quantities common to all blocks, one entry per block (W N,).
         elements_rate: by the rate, of every set (W E,), and of friction.
         contact_parameters, radius: by the parameters of contact, see `ContactAdjoint`; None without contact.
@@ -69,7 +69,7 @@ class CoupledInputs:
     rate: wp.array
     damping: wp.array
     gravity: wp.array
-    drag: wp.array | None
+    coefficients: dict[str, wp.array]
     elements_rate: list[wp.array]
     contact_parameters: wp.array | None = None
     radius: wp.array | None = None
@@ -169,7 +169,7 @@ class CoupledStepAdjoint:
             rate=make(real),
             damping=make(real),
             gravity=make(),
-            drag=self._quadratic.by_coefficients if self._quadratic else None,
+            coefficients={force.force.name: force.by_coefficients for force in self.forces if force.quadratic},
             elements_rate=[
                 wp.zeros(part.elements * coupled.worlds, dtype=real, device=self.device) for part in coupled.sets
             ],
@@ -342,7 +342,7 @@ class CoupledStepAdjoint:
             *(cotangents.end, start.q, start.v, *start.last, *cotangents.frames, *own_rows),
             *(inputs.load, inputs.mass, inputs.rate, inputs.damping, inputs.gravity, *inputs.elements_rate),
             *(*inputs.parameters, *inputs.data, *inputs.end_data),
-            *([inputs.drag] if self._quadratic else []),
+            *inputs.coefficients.values(),
             *([self.contact.by_groups, self.contact.by_radius] if self.contact else []),
             *([self.solve.failed] if self.solve.failed is not None else []),
         ):

@@ -47,7 +47,7 @@ def force_adjoints(model, part, midpoint: bool, gather=None) -> list:
     """Return the adjoints of the forces on a rod group or on the coupled system; `gather`: see `CoupledDragAdjoint`."""
     result = [FollowerAdjoint(model, part, midpoint)] if part.host.followers else []
     if part is model.coupled:
-        return [*result, CoupledDragAdjoint(model, part, midpoint, gather)] if part.host.drag else result
+        return [*result, CoupledDragAdjoint(model, part, midpoint, gather)] if part.host.quadratic else result
     return [*result, RodDragAdjoint(model, part, midpoint)] if part.kind.quadratic else result
 
 
@@ -141,7 +141,7 @@ class RodDragAdjoint:
             before.theta,
             pull.solved.x,
             pull.solved.theta,
-            group.drag,
+            self.force.coefficients,
             self.force.flow,
             pull.w,
         ]
@@ -167,7 +167,7 @@ class CoupledDragAdjoint:
     quadratic = True
 
     def __init__(self, model, coupled, midpoint: bool, gather):
-        real, device, (ends, angles, _) = model.types.real, coupled.device, coupled.host.drag
+        real, device, (ends, angles) = model.types.real, coupled.device, coupled.host.forced_edges
         self.coupled, self.force, self._gather = coupled, CoupledDrag(model, midpoint), gather
         self._edges, self._nodes = drag.coupled_kernels(real, midpoint)
         self._ends, self._angles = (
@@ -204,7 +204,18 @@ class CoupledDragAdjoint:
         """Add the gradients of drag."""
         coupled, before, q, w, start = self.coupled, pull.before, pull.solved.q, pull.w, pull.start
         tangents, by_tangents = (pull.predicted, pull.by_predicted) if self.force.midpoint else (before.q, start.q)
-        read = [tangents, before.q, before.v, q, self._ends, self._angles, coupled.drag, self.force.flow, w, pull.rate]
+        read = [
+            tangents,
+            before.q,
+            before.v,
+            q,
+            self._ends,
+            self._angles,
+            self.force.coefficients,
+            self.force.flow,
+            w,
+            pull.rate,
+        ]
         outputs = [self._by_tangent, self._by_velocity, self.by_coefficients]
         self._launch(self._edges, self.by_coefficients.shape[1], [*read, coupled.blocks], outputs)
         for slots, target in ((self._by_tangent, by_tangents), (self._by_velocity, start.v)):

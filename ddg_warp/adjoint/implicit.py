@@ -258,6 +258,8 @@ def _copied(state: State, inputs: list) -> tuple[State, list]:
 def _cloned(value):
     if isinstance(value, list):
         return [wp.clone(array) for array in value]
+    if isinstance(value, dict):
+        return {name: wp.clone(array) for name, array in value.items()}
     return None if value is None else wp.clone(value)
 
 

@@ -48,7 +48,7 @@ class RodInputs:
         mass, rotary: by masses of nodes and rotary inertia of edges (n, R).
         load: by the forces on nodes and the moments on angles (block, n, R); zero at fixed dofs.
         held: by the prescribed positions of fixed dofs at the solution (block, n, R).
-        drag: by drag coefficients (rows, n, R); None without drag.
+        coefficients: by coefficients of edges (rows, n, R), by name of the force.
         rate, damping, gravity: by the quantities common to all nodes, a contribution per node (n, R). `rate` excludes the time
             dependence of motions, loads and fields.
     """
@@ -61,7 +61,7 @@ class RodInputs:
     rate: wp.array
     damping: wp.array
     gravity: wp.array
-    drag: wp.array | None = None
+    coefficients: dict[str, wp.array]
 
 
 @dataclass
@@ -155,7 +155,7 @@ class RodStepAdjoint:
             rate=self._make(),
             damping=self._make(),
             gravity=self._make(self.vector),
-            drag=self._quadratic.by_coefficients if self._quadratic else None,
+            coefficients={force.force.name: force.by_coefficients for force in self.forces if force.quadratic},
         )
 
     def suit(self, step, s: float) -> bool:

@@ -11,8 +11,7 @@ from ddg_warp.compile.ghost_nodes import GhostNodes
 from ddg_warp.compile.rods import UniformRods, alike, compress, coupled_rods, piece_of
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.elements.rod_layout import RodKind
-from ddg_warp.kernels.forces.drag import ROWS as DRAG_ROWS
-from ddg_warp.scene import drag
+from ddg_warp.scene import edge_forces
 from ddg_warp.scene.scene import Scene
 
 PADDING = 1.25  # longest over shortest rod of a group
@@ -34,7 +33,7 @@ class RodGroupData(DofStorage):
         mass: mass of nodes (n, R) [kg]; rotary: inertia of edges about the tangent (n, R) [kg m^2].
         fixed: bits of the fixed components of a node; the bit after the components is the twist angle (n, R).
         length: rod lengths (R,) [m].
-        drag: drag coefficients of edges (rows, n, R), in the order of `kernels.forces.drag`; None without.
+        coefficients: of forces on edges (rows, n, R) by name; see `scene.edge_forces`.
         parameters: parameters of all terms, "term.parameter", each broadcastable to (n, R).
     """
 
@@ -49,7 +48,7 @@ class RodGroupData(DofStorage):
     rotary: np.ndarray
     fixed: np.ndarray
     length: np.ndarray
-    drag: np.ndarray | None
+    coefficients: dict[str, np.ndarray]
     parameters: dict[str, np.ndarray]
 
     @property
@@ -138,7 +137,7 @@ def compile_rod_groups(scene: Scene, chosen: np.ndarray | None = None) -> list[R
         raise SceneError(
             "the scene has no rods and no shells; add some with scene.add_rods(points, section=..., material=...)"
         )
-    ghosts, laws = GhostNodes(scene), drag.Laws(scene)
+    ghosts, laws = GhostNodes(scene), edge_forces.laws_of(scene)
     chosen = ~coupled_rods(scene) if chosen is None else chosen
     parts = [part for batch in scene.batches for part in alike(scene.dimension, batch, ghosts, laws, chosen)]
     parts.sort(key=lambda part: (*part.kind.key, part.nodes))
@@ -159,13 +158,13 @@ def compile_rod_groups(scene: Scene, chosen: np.ndarray | None = None) -> list[R
     return rod_groups
 
 
-def _join(parts: list[UniformRods], ghosts: GhostNodes, laws: drag.Laws) -> RodGroupData:
+def _join(parts: list[UniformRods], ghosts: GhostNodes, laws: list) -> RodGroupData:
     kind, rods = parts[0].kind, np.concatenate([part.rods for part in parts])
     count = np.concatenate([np.full(len(part.rods), part.nodes) for part in parts])
     n, total = int(count.max()), len(rods)
     x, frame = np.zeros((n, total, kind.dim)), np.zeros((kind.lagged_rows, n, total))
     mass, rotary, length, parameters, start = np.zeros((n, total)), np.zeros((n, total)), np.zeros(total), [], 0
-    coefficients = np.zeros((DRAG_ROWS, n, total)) if kind.quadratic else None
+    coefficients = {}
     for run in (run for part in parts for run in part.runs):
         piece, columns = piece_of(run, ghosts, laws), slice(start, start + len(run.rods))
         edges = piece.rotary.shape[1]
@@ -174,8 +173,9 @@ def _join(parts: list[UniformRods], ghosts: GhostNodes, laws: drag.Laws) -> RodG
         if kind.twist:
             frame[0:3, :edges, columns], frame[3:6, :edges, columns] = piece.director.T, piece.tangent.T
             frame[6, : piece.reference_twist.shape[1], columns] = piece.reference_twist.T
-        if kind.quadratic:
-            coefficients[:, :edges, columns] = piece.drag.T
+        for name, values in piece.coefficients.items():
+            along = coefficients.setdefault(name, np.zeros((values.shape[-1], n, total)))
+            along[:, :edges, columns] = values.T
         length[columns], start = piece.length, columns.stop
         parameters.append((len(run.rods), piece.parameters))
     fixed = np.zeros((n, total), np.uint8)
@@ -193,7 +193,7 @@ def _join(parts: list[UniformRods], ghosts: GhostNodes, laws: drag.Laws) -> RodG
         rotary=rotary,
         fixed=fixed,
         length=length,
-        drag=coefficients,
+        coefficients=coefficients,
         parameters={
             name: _join_parameter([(rods, values[name]) for rods, values in parameters], n) for name in parameters[0][1]
         },

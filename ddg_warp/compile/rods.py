@@ -12,7 +12,6 @@ from ddg_warp.errors import SceneError
 from ddg_warp.geometry import polyline
 from ddg_warp.kernels.elements.rod_layout import RodKind
 from ddg_warp.kernels.terms import REGISTRY, Term, term_key
-from ddg_warp.scene import drag
 from ddg_warp.scene.contact import contact_names
 from ddg_warp.scene.descriptions import RodBatch
 from ddg_warp.scene.scene import Scene
@@ -21,7 +20,7 @@ from ddg_warp.scene.validate import check_batch
 
 @dataclass(frozen=True)
 class UniformRods:
-    """Rods of one batch with equal ghosts, all with drag or all without."""
+    """Rods of one batch with equal ghosts, all with forces on edges or all without."""
 
     batch: RodBatch
     rows: np.ndarray  # of the batch
@@ -61,7 +60,7 @@ class RodArrays:
     length: np.ndarray
     parameters: dict[str, np.ndarray]
     stiffness: list[np.ndarray]  # EI1, EI2 and GJ of the section, each broadcastable to (R, edges)
-    drag: np.ndarray | None  # coefficients of the drag law (R, edges, rows), None without
+    coefficients: dict[str, np.ndarray]  # of forces on edges (R, edges, rows) by name
 
 
 def coupled_rods(scene: Scene) -> np.ndarray:
@@ -79,24 +78,23 @@ def coupled_rods(scene: Scene) -> np.ndarray:
     return chosen
 
 
-def alike(
-    dimension: int, batch: RodBatch, ghosts: GhostNodes, laws: drag.Laws, chosen: np.ndarray
-) -> list[UniformRods]:
-    """Return the chosen rods (R,) of a batch, grouped by ghosts and drag."""
+def alike(dimension: int, batch: RodBatch, ghosts: GhostNodes, laws: list, chosen: np.ndarray) -> list[UniformRods]:
+    """Return the chosen rods (R,) of a batch, grouped by ghosts and forces on edges; `laws`: see `edge_forces.laws_of`."""
     check_batch(batch, dimension)
     chosen = chosen[batch.first : batch.first + batch.rods]
     flags = ghosts.count[batch.first : batch.first + batch.rods]
     if batch.closed and flags.any():
         raise SceneError(f"rod {batch.first + int(np.argmax(flags.any(1)))} is closed: it has no end to clamp")
-    dragged, result = laws.of_rods[batch.first : batch.first + batch.rods] >= 0, []
-    for *pattern, drags in product((0, 1), (0, 1), (False, True)):
-        rows = np.flatnonzero((flags == pattern).all(1) & (dragged == drags) & chosen)
+    forced = np.any([each.of_rods[batch.first : batch.first + batch.rods] >= 0 for each in laws], axis=0)
+    result = []
+    for *pattern, quadratic in product((0, 1), (0, 1), (False, True)):
+        rows = np.flatnonzero((flags == pattern).all(1) & (forced == quadratic) & chosen)
         if rows.size:
-            result.append(UniformRods(batch, rows, tuple(pattern), _kind(dimension, batch, drags)))
+            result.append(UniformRods(batch, rows, tuple(pattern), _kind(dimension, batch, quadratic)))
     return result
 
 
-def _kind(dimension: int, batch: RodBatch, dragged: bool) -> RodKind:
+def _kind(dimension: int, batch: RodBatch, quadratic: bool) -> RodKind:
     prefix = "planar" if dimension == 2 else "rod"
     names = [f"{prefix}_stretch"]
     if batch.bend:
@@ -105,10 +103,10 @@ def _kind(dimension: int, batch: RodBatch, dragged: bool) -> RodKind:
     viscous = bool(np.any(np.asarray(batch.section.viscosity) > 0.0))
     keys = [*(term_key(name, batch.by_angle) for name in names[:-1]), names[-1]]  # the last is stretch
     terms = tuple(REGISTRY[key].of(batch.laws).damped(viscous) for key in keys)
-    return RodKind(dimension, batch.twist, batch.closed, terms, quadratic=dragged)
+    return RodKind(dimension, batch.twist, batch.closed, terms, quadratic=quadratic)
 
 
-def piece_of(part: UniformRods, outside: GhostNodes, laws: drag.Laws) -> RodArrays:
+def piece_of(part: UniformRods, outside: GhostNodes, laws: list) -> RodArrays:
     """Return the arrays of some rods.
 
     Raises:
@@ -181,6 +179,7 @@ def piece_of(part: UniformRods, outside: GhostNodes, laws: drag.Laws) -> RodArra
 
         values = _bound(batch, term, inputs, on_edges, None if stretch else cells)
         parameters |= {f"{term.name}.{name}": compress(np.atleast_2d(v)) for name, v in values.items()}
+    radius = on_edges(np.nan if section.radius is None else section.radius)
     return RodArrays(
         batch,
         rods,
@@ -195,9 +194,7 @@ def piece_of(part: UniformRods, outside: GhostNodes, laws: drag.Laws) -> RodArra
         rod_lengths.sum(1),
         parameters,
         [on_edges(value) for value in (section.EI1, section.EI2, section.GJ)],
-        laws.coefficients(rods, batch, on_edges(np.nan if section.radius is None else section.radius), rod_lengths)
-        if kind.quadratic
-        else None,
+        {each.name: each.coefficients(rods, batch, radius, rod_lengths) for each in laws} if kind.quadratic else {},
     )
 
 

@@ -134,8 +134,8 @@ class CoupledModel:
     Attributes:
         mass: of dof blocks (worlds, N) [kg, kg m^2].
         has_custom_mass: True if `mass` may differ from `host`.
-        moves: masses of dof blocks (N,), positive where inertia or drag determine a rate.
-        drag: drag coefficients of edges, world by world (rows, W E), see `kernels.forces.drag`; None without.
+        moves: masses of dof blocks (N,), positive where inertia or a quadratic potential determine a rate.
+        coefficients: coefficients of forces on edges by name, world by world (rows, W E); see `CoupledSystem.forced_edges`.
         contact_parameters: contact parameters by name: "stiffness", "range" and "friction" (worlds, groups, groups), "radius"
             (worlds, bodies).
     """
@@ -150,18 +150,20 @@ class CoupledModel:
         self.mass = wp.array(np.tile(host.mass, (worlds, 1, 1)), dtype=self.vector, device=device)
         self._stiffnesses = None, None  # key and values
         self._along = {}  # elements of pieces of rods
-        self.has_custom_mass, self.drag, drag_mass = False, None, np.zeros((host.blocks, 3))
-        if host.drag:
-            ends, angles, coefficients = host.drag
-            self.drag = wp.array(np.tile(coefficients, (1, worlds)), dtype=real, device=device)
-            drag_mass[ends] = 1.0
-            drag_mass[angles[angles >= 0], 0] = 1.0
+        self.has_custom_mass = False
+        self.coefficients = {
+            name: wp.array(np.tile(values, (1, worlds)), dtype=real, device=device)
+            for name, values in host.coefficients.items()
+        }
+        held, (ends, angles) = np.zeros((host.blocks, 3)), host.forced_edges
+        held[ends] = 1.0
+        held[angles[angles >= 0], 0] = 1.0
         self.contact_parameters = {}
         if host.contact_parameters:
             for name, values in host.contact_parameters.numbers.items():
                 tiled = np.tile(values, (worlds, *[1] * values.ndim))
                 self.contact_parameters[name] = wp.array(tiled, dtype=real, device=device)
-        self.moves = wp.array(host.mass + drag_mass, dtype=self.vector, device=device)
+        self.moves = wp.array(host.mass + held, dtype=self.vector, device=device)
         self.ends = wp.array(np.ascontiguousarray(host.ends, np.int32).reshape(-1, 2), dtype=int, device=device)
         serial = arrays.serial(device)
         self.nodes, self.node_threads = (

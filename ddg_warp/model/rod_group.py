@@ -11,7 +11,7 @@ from ddg_warp.compile.rod_groups import RodGroupData
 from ddg_warp.kernels.core.nodes import state_type
 from ddg_warp.kernels.elements import rod_layout
 from ddg_warp.model.parameters import ParameterTable
-from ddg_warp.scene import drag
+from ddg_warp.scene import edge_forces
 
 
 class RodGroup:
@@ -47,7 +47,7 @@ class RodGroup:
         self.mass = put(host.mass, real)
         self.rotary = put(host.rotary, real)
         self.has_custom_mass = False
-        self.drag = put(host.drag, real) if kind.quadratic else None
+        self.coefficients = {name: put(values, real) for name, values in host.coefficients.items()}
         self.fixed = put(host.fixed, wp.uint8)
         self.anchor = put(_last_anchor(host), int)
         load, moment = _constant_loads(host) if host.loaded else (np.zeros((1, 1, kind.dim)), np.zeros((1, 1)))
@@ -133,8 +133,10 @@ class RodGroup:
         host = self.host
         mass, length = host.mass.sum(0) / host.count, host.length
         if self.kind.quadratic:
-            mass = mass + s * drag.least(host.drag.T) * host.length / host.count
-            length = np.where(host.fixed.any(0), length, np.inf)  # over long steps only drag acts on a free rod
+            mass = (
+                mass + s * edge_forces.least({n: v.T for n, v in host.coefficients.items()}) * host.length / host.count
+            )
+            length = np.where(host.fixed.any(0), length, np.inf)  # over long steps only these forces act on a free rod
         mass, length = (np.tile(values, self.worlds) for values in (mass, length))
         return precision.stiffnesses(self.kind, mass, length, self.parameters.values, s)
 

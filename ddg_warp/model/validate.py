@@ -3,7 +3,7 @@
 import numpy as np
 
 from ddg_warp.errors import SceneError
-from ddg_warp.scene import drag
+from ddg_warp.scene import edge_forces
 
 CARRIED = 1e-40  # smallest magnitude that float32, in its subnormal range, keeps to four digits
 
@@ -53,7 +53,7 @@ def refuse_friction(model) -> None:
 
 
 def require_mass(model) -> None:
-    """Refuse free nodes of uncoupled rods that have neither mass nor drag."""
+    """Refuse free nodes of uncoupled rods without mass and without a force in all directions."""
     for group in model.groups:
         host, kind = group.host, group.kind
         positions = (1 << kind.dim) - 1
@@ -61,11 +61,10 @@ def require_mass(model) -> None:
         nodes = (k >= host.first) & (k < host.first + host.own)
         massless = (host.mass <= 0.0) & ((host.fixed & positions) != positions) & nodes
         if kind.quadratic:
-            first, last = drag.holds(host.drag)  # of edges; the last node of an open rod begins none
+            first, last = edge_forces.holds(host.coefficients)  # of edges; the last node of an open rod begins none
             massless &= ~(first | np.roll(last, 1, axis=0))
         if massless.any():
             k, column = np.argwhere(massless)[0]
             raise SceneError(
-                f"node {k - host.first[column]} of rod {host.rods[column]} is free and has no mass; "
-                "give the material a density, the section a mass_per_length, or the rod drag along and across"
+                f"node {k - host.first[column]} of rod {host.rods[column]} is free and has no mass; {edge_forces.HOLD}"
             )

@@ -41,8 +41,7 @@ def report(model) -> str:
             present.add(term.name)
             elements = int((host.count - (0 if kind.closed else term.measure.span)).sum()) * model.worlds
             lines.append(f"  {term.name}: {elements} elements, {term.measure.name} x {term.density.name}")
-        if kind.quadratic:
-            lines.append("  drag, implicit")
+        lines += [f"  {name}, implicit" for name in host.coefficients]
         solver = CLOSED if kind.closed else SOLVERS[automatic(group)]
         lines.append(f"  solver: {solver}, linear algebra in {model.types.linear.__name__}")
         lines += step_lines(model, lambda s, group=group: (group.float32_errors(s), _split_errors(group, s)))
@@ -130,8 +129,7 @@ def coupled_lines(model) -> list[str]:
     for part in coupled.sets:
         measure, density = part.term.measure.name, part.term.density.name
         lines.append(f"  {part.term.name}: {part.elements * model.worlds} elements, {measure} x {density}")
-    if host.drag:
-        lines.append(f"  drag on {host.drag[0].shape[1]} edges of rods, implicit")
+    lines += [f"  {name} on {values.shape[1]} edges of rods, implicit" for name, values in host.coefficients.items()]
     reals, solver, bands, mixed_axial = 9 * table.positions, f"PCG ({name})", "", False
     if substructuring and substructuring.banded:
         substructuring.plan.bind(host, table.rows.numpy(), table.columns.numpy(), substructuring.kept)

@@ -113,7 +113,7 @@ def drag(model, state) -> Drag:
     if model.coupled is not None:
         force = np.zeros((model.worlds, model.coupled.blocks, 3))
         v = force
-        if model.coupled.host.drag:
+        if model.coupled.host.quadratic:
             resisted = CoupledDrag(model)
             v = resisted.rates(state.coupled, state.lead)
             inertia, u = resisted.at(state.coupled, state.time)

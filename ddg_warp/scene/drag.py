@@ -167,13 +167,6 @@ def flow_at(scene, t: float, error=SolverError) -> np.ndarray:
     return flow
 
 
-def check_flow(scene) -> None:
-    """Refuse an invalid flow at t = 0, or a flow without rods with drag."""
-    flow_at(scene, 0.0, SceneError)
-    if not scene.drags and (callable(scene.flow) or any(scene.flow)):
-        raise SceneError("flow is given, and no rod feels it; call drag(...), or leave flow out")
-
-
 def _not_negative(label: str, value, unit: str) -> float:
     return argument_checks.number(label, value, f"one number that is not negative [{unit}]", lambda v: v >= 0.0)
 
@@ -273,6 +266,8 @@ class Laws:
         SceneError: a rod has two.
     """
 
+    name = "drag"
+
     def __init__(self, scene):
         self._drags, self.of_rods = scene.drags, np.full(scene.rod_count, -1)
         self.given, self._row = [drag.law for drag in scene.drags], np.zeros(scene.rod_count, int)
@@ -304,14 +299,21 @@ class Laws:
             result[np.ix_(chosen, real)] = rows
         return result
 
+    @staticmethod
+    def check(scene) -> None:
+        """Refuse an invalid flow at t = 0, or a flow without rods with drag."""
+        flow_at(scene, 0.0, SceneError)
+        if not scene.drags and (callable(scene.flow) or any(scene.flow)):
+            raise SceneError("flow is given, and no rod feels it; call drag(...), or leave flow out")
 
-def holds(coefficients: np.ndarray) -> np.ndarray:
-    """Return masks of first and last nodes of edges (2, ...) with drag in all directions, by coefficients (rows, ...)."""
-    tangential, normal, _, lateral, friction, _, _, _, first, last = coefficients
-    along = (tangential + friction > 0.0) & (normal + lateral > 0.0)
-    return np.stack([along | (first > 0.0), along | (last > 0.0)])
+    @staticmethod
+    def holds(coefficients: np.ndarray) -> np.ndarray:
+        """Return masks of first and last nodes of edges (2, ...) with drag in all directions, by coefficients (rows, ...)."""
+        tangential, normal, _, lateral, friction, _, _, _, first, last = coefficients
+        along = (tangential + friction > 0.0) & (normal + lateral > 0.0)
+        return np.stack([along | (first > 0.0), along | (last > 0.0)])
 
-
-def least(coefficients: np.ndarray) -> np.ndarray:
-    """Return the smallest drag per length and velocity [N s/m^2] of rods (R,) from coefficients (R, edges, rows); 0 if granular."""
-    return coefficients[..., :2].mean(1).min(1)
+    @staticmethod
+    def least(coefficients: np.ndarray) -> np.ndarray:
+        """Return the smallest drag per length and velocity [N s/m^2] of rods (R,) by coefficients (R, edges, rows); 0 if granular."""
+        return coefficients[..., :2].mean(1).min(1)

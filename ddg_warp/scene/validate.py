@@ -8,7 +8,7 @@ import numpy as np
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.geometry import polyline
-from ddg_warp.scene import drag
+from ddg_warp.scene import edge_forces
 from ddg_warp.scene.contact import check_contact
 from ddg_warp.scene.descriptions import Dynamics, PathAnalysis, Statics
 from ddg_warp.scene.grip import Grip
@@ -44,7 +44,7 @@ def check_settings(scene) -> None:
 
 
 def check_scene(scene) -> None:
-    """Check everything but rods: settings, gravity, drag, magnets, contact, and motions that start at rest.
+    """Check everything but rods: settings, gravity, forces, magnets, contact, and motions that start at rest.
 
     Raises:
         SceneError: the first error.
@@ -54,7 +54,8 @@ def check_scene(scene) -> None:
         raise SceneError(
             f"gravity is {tuple(scene.gravity)}; a scene of dimension 2 stays in the plane of x and z, give 0 along y"
         )
-    drag.check_flow(scene)
+    for laws in edge_forces.LAWS:
+        laws.check(scene)
     _check_magnets(scene)
     check_contact(scene)
     every = (*scene.supports, *scene.shell_supports, *scene.ring_supports, *scene.obstacles)

@@ -1,15 +1,9 @@
-"""Named parameters outside terms: masses, rotary inertia, drag coefficients and contact parameters.
+"""Named parameters outside terms: masses, rotary inertia, coefficients of forces and contact parameters.
 
     "rod.mass"       [kg] of the points of all rods, including point masses of `Scene.add_mass`
     "rod.inertia"    [kg m^2] about the tangent, of the edges of rods with twist
     "shell.mass"     [kg] of the vertices of all shells, "meridian.mass" of the nodes of all shells of revolution
-    "drag.tangential", "drag.normal" [N s/m^2], "drag.rotational" [N s]
-                     of the edges of rods with viscous drag, per length; rotational drag of those with twist
-    "drag.lateral", "drag.friction", "drag.leading" [N/m], "drag.slope" (the tangent of `angle`), "drag.speed" [m/s]
-                     of the edges of rods in a granular medium
-    "drag.first", "drag.last" [N s/m]
-                     of bodies at the first and at the last node of the edges of rods with drag; `Scene.drag(nodes=...)` assigns
-                     the coefficient of a node to the edge that starts there, that of the last node to the last edge
+    "FORCE.NAME"     of the edges of rods with a force, see its class in `solve.forces`
     "contact.stiffness" [N/m], "contact.range" [m], no larger than the largest of the scene, "contact.friction"
                      between objects of two names, or of one, that may come into contact. Friction exists in scenes with friction;
                      if anisotropic it is the smallest nonzero coefficient, to which the others keep their ratios
@@ -24,28 +18,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ddg_warp.kernels.forces import drag
 from ddg_warp.model.masses import point_masses
+from ddg_warp.solve.forces.force_list import WITH_PARAMETERS
 from ddg_warp.torch import contact_parameters
 from ddg_warp.torch.parameter_storage import ArrayParameterView
 from ddg_warp.torch.state_layout import view
 
 MASSES = ("rod.mass", "shell.mass", "meridian.mass")
-VISCOUS = {"tangential": drag.TANGENTIAL, "normal": drag.NORMAL, "rotational": drag.ROTATIONAL}
-GRANULAR = {
-    "lateral": drag.LATERAL,
-    "friction": drag.FRICTION,
-    "leading": drag.LEADING,
-    "slope": drag.SLOPE,
-    "speed": drag.SPEED,
-}
-BODIES = {"first": drag.FIRST, "last": drag.LAST}
-COEFFICIENTS = {f"drag.{name}": row for name, row in (VISCOUS | GRANULAR | BODIES).items()}
+COEFFICIENTS = {f"{force.name}.{name}": (force, name) for force in WITH_PARAMETERS for name in force.parameters}
 NAMES = (*MASSES, "rod.inertia", *COEFFICIENTS, *contact_parameters.NAMES)
-SIGNED, POSITIVE = (
-    ("drag.leading",),
-    ("drag.slope", "drag.speed", "contact.range", "contact.radius"),
-)  # all others must be nonnegative
+SIGNED = [f"{force.name}.{name}" for force in WITH_PARAMETERS for name in force.signed]
+POSITIVE = [
+    *(f"{force.name}.{name}" for force in WITH_PARAMETERS for name in force.positive),
+    *("contact.range", "contact.radius"),  # all others must be nonnegative
+]
 
 
 @dataclass
@@ -119,7 +105,7 @@ def rule(name: str, usual: np.ndarray) -> tuple[str, Callable]:
 def _parts(model, name: str) -> Iterator[_Part]:
     if name in MASSES:
         return _masses(model, name)
-    return _inertia(model) if name == "rod.inertia" else _drag(model, name)
+    return _inertia(model) if name == "rod.inertia" else _coefficients(model, name)
 
 
 def _masses(model, name: str) -> Iterator[_Part]:
@@ -193,38 +179,40 @@ def _inertia(model) -> Iterator[_Part]:
         )
 
 
-def _drag(model, name: str) -> Iterator[_Part]:
-    row, granular = COEFFICIENTS[name], name.partition(".")[2] in GRANULAR
+def _coefficients(model, name: str) -> Iterator[_Part]:
+    force, parameter = COEFFICIENTS[name]
+    of_force, row = force.name, force.parameters[parameter]
+
+    def found(inputs):
+        return view(inputs.coefficients[of_force])[row] if of_force in inputs.coefficients else None
+
     for index, group in enumerate(model.groups):
-        if group.kind.quadratic and (group.kind.twist or row != drag.ROTATIONAL):
+        if of_force in group.coefficients:
             k, column, rows = model.order.edge_places(group)
-            places, usual = k * group.rods + column, group.host.drag[row]
-            chosen = ((group.host.drag[drag.SPEED].ravel()[places] > 0.0) == granular) | (row in BODIES.values())
+            places, coefficients = k * group.rods + column, group.host.coefficients[of_force]
+            chosen = force.has(parameter, coefficients.reshape(len(coefficients), -1)[:, places], group.kind.twist)
             places, rows = places[chosen], rows[chosen]
             yield _Part(
                 index,
                 True,
                 name,
-                usual,
+                coefficients[row],
                 places,
                 rows,
-                usual.ravel()[places],
-                lambda group=group: view(group.drag)[row],
-                lambda inputs: None if inputs.drag is None else view(inputs.drag)[row],
+                coefficients[row].ravel()[places],
+                lambda group=group: view(group.coefficients[of_force])[row],
+                found,
             )
-    if model.coupled is not None and model.coupled.host.drag:
-        coupled, (_, angles, coefficients) = model.coupled, model.coupled.host.drag
-        places, rows, first_edge = [np.zeros(0, int)], [np.zeros(0, int)], 0
-        for rod in coupled.host.rods:
-            if rod.piece.kind.quadratic:
-                local_edges = np.arange(len(rod.nodes) - (0 if rod.piece.kind.closed else 1))
-                places.append(first_edge + rod.first + local_edges)
-                rows.append(model.order.edge_starts[rod.rod] + local_edges)
-                first_edge += len(rod.piece.drag[rod.row])
+    if model.coupled is not None and of_force in model.coupled.coefficients:
+        coupled, coefficients = model.coupled, model.coupled.host.coefficients[of_force]
+        places, rows, first_edge = [], [], 0
+        for rod in filter(lambda rod: rod.piece.kind.quadratic, coupled.host.rods):
+            local_edges = np.arange(len(rod.nodes) - (0 if rod.piece.kind.closed else 1))
+            places.append(first_edge + rod.first + local_edges)
+            rows.append(model.order.edge_starts[rod.rod] + local_edges)
+            first_edge += rod.piece.rotary.shape[1]
         places, rows, shape = np.concatenate(places), np.concatenate(rows), (coupled.worlds, coefficients.shape[1], 1)
-        chosen = ((coefficients[drag.SPEED, places] > 0.0) == granular) | (row in BODIES.values())
-        if row == drag.ROTATIONAL:
-            chosen &= angles[places] >= 0
+        chosen = force.has(parameter, coefficients[:, places], coupled.host.forced_edges[1][places] >= 0)
         places, rows = places[chosen], rows[chosen]
         yield _Part(
             -1,
@@ -234,6 +222,6 @@ def _drag(model, name: str) -> Iterator[_Part]:
             places,
             rows,
             coefficients[row, places],
-            lambda: view(coupled.drag)[row].view(shape),
-            lambda inputs: None if inputs.drag is None else view(inputs.drag)[row].view(shape[:2]),
+            lambda: view(coupled.coefficients[of_force])[row].view(shape),
+            lambda inputs: None if (values := found(inputs)) is None else values.view(shape[:2]),
         )

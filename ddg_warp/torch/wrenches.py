@@ -469,7 +469,7 @@ class _Rods(_Part):
         k, column = k[some], column[some]
         following = np.where(k + 1 == count[some], 0, k + 1)
         first, last = (self._index(node * group.rods + column).reshape(-1) for node in (k, following))
-        p = view(group.drag).reshape(drag.ROWS, -1)[:, first]
+        p = view(group.coefficients["drag"]).reshape(drag.ROWS, -1)[:, first]
         return first, last, first if group.kind.twist else first * 0 - 1, p
 
     def _element_forces(self, states, parameter_tensors, dt: float) -> torch.Tensor:
@@ -576,14 +576,14 @@ class _Coupled(_Part):
     @property
     def resisted(self) -> bool:
         """True with drag."""
-        return self.part.drag is not None
+        return self.part.host.quadratic
 
     def _edges(self) -> tuple:
         """Return edges with drag, see `_Part`."""
-        ends, angles, _ = self.part.host.drag
+        ends, angles = self.part.host.forced_edges
         first, last, of_angles = (self._index(values).reshape(-1) for values in (*ends, angles))
         free = self._long(angles < 0).repeat(len(self._worlds)) > 0
-        return first, last, torch.where(free, -1, of_angles), view(self.part.drag)
+        return first, last, torch.where(free, -1, of_angles), view(self.part.coefficients["drag"])
 
     def _contact(self, after: dict) -> torch.Tensor | None:
         """Return contact forces on all dof blocks; None without contact."""

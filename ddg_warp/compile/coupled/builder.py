@@ -17,7 +17,7 @@ from ddg_warp.compile.rods import RodArrays, alike, coupled_rods, piece_of
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import fundamental_forms
 from ddg_warp.geometry.surface import Surface
-from ddg_warp.scene import drag
+from ddg_warp.scene import edge_forces
 from ddg_warp.scene.shells_and_joints import COINCIDE
 
 
@@ -36,7 +36,7 @@ def compile_coupled(scene, along: bool = False) -> CoupledSystem | None:
         return None
     if scene.shells and scene.dimension == 2:
         raise SceneError("a scene with shells has dimension 3; leave dimension=2 to rods")
-    builder, ghosts, laws = _Builder(scene, along), GhostNodes(scene), drag.Laws(scene)
+    builder, ghosts, laws = _Builder(scene, along), GhostNodes(scene), edge_forces.laws_of(scene)
     for batch in scene.batches:
         if chosen[batch.first : batch.first + batch.rods].any():
             if scene.dimension == 2:

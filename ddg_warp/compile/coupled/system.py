@@ -20,7 +20,7 @@ from ddg_warp.compile.residual_tolerance import ToleranceBodies
 from ddg_warp.compile.rods import RodArrays
 from ddg_warp.geometry import fundamental_forms
 from ddg_warp.geometry.surface import Surface
-from ddg_warp.scene import drag
+from ddg_warp.scene import edge_forces
 
 
 @dataclass
@@ -191,16 +191,22 @@ class CoupledSystem(DofStorage):
         return any(rod.piece.kind.quadratic for rod in self.rods)
 
     @cached_property
-    def drag(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """(nodes (2, E), angle block or -1 (E,), coefficients (rows, E)) of edges with drag; None without any."""
-        pieces = []
-        for rod in self.rods:
-            if rod.piece.kind.quadratic:
-                coefficients = rod.piece.drag[rod.row]
-                ends = rod.ends[: len(coefficients)].T
-                angles = rod.all_edges if rod.all_edges.size else np.full(len(coefficients), -1)
-                pieces.append((ends, angles, coefficients.T))
-        return tuple(np.concatenate(parts, -1) for parts in zip(*pieces, strict=True)) if pieces else None
+    def forced_edges(self) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes (2, E), and angle block or -1 (E,), of the edges of rods with a quadratic potential."""
+        ends, angles = [np.zeros((2, 0), int)], [np.zeros(0, int)]
+        for rod in filter(lambda rod: rod.piece.kind.quadratic, self.rods):
+            ends.append(rod.ends[: rod.piece.rotary.shape[1]].T)
+            angles.append(rod.all_edges if rod.all_edges.size else np.full(ends[-1].shape[1], -1))
+        return np.concatenate(ends, axis=1), np.concatenate(angles)
+
+    @cached_property
+    def coefficients(self) -> dict[str, np.ndarray]:
+        """Coefficients of forces on `forced_edges` (rows, E) by name; see `scene.edge_forces`."""
+        rods = [rod for rod in self.rods if rod.piece.kind.quadratic]
+        return {
+            name: np.concatenate([rod.piece.coefficients[name][rod.row].T for rod in rods], axis=-1)
+            for name in (rods[0].piece.coefficients if rods else ())
+        }
 
     @cached_property
     def rod_order(self) -> RodOrder:
@@ -271,8 +277,8 @@ class CoupledSystem(DofStorage):
 
 
 def inert_mass(piece, s: float) -> np.ndarray:
-    """Return the mean nodal mass of rods of a piece (R,) [kg], plus drag times the step length s [s]."""
+    """Return the mean nodal mass of rods of a piece (R,) [kg], plus the resistance of forces on edges times the step length s [s]."""
     mass = piece.mass.mean(1)
     if piece.kind.quadratic:
-        mass = mass + s * drag.least(piece.drag) * piece.length / piece.mass.shape[1]
+        mass = mass + s * edge_forces.least(piece.coefficients) * piece.length / piece.mass.shape[1]
     return mass

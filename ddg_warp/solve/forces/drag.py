@@ -12,16 +12,51 @@ from ddg_warp.scene.drag import flow_at
 from ddg_warp.solve.forces.force import Force
 from ddg_warp.solve.linear.sparse_system import lists
 
+VISCOUS = {"tangential": drag.TANGENTIAL, "normal": drag.NORMAL, "rotational": drag.ROTATIONAL}
+GRANULAR = {
+    "lateral": drag.LATERAL,
+    "friction": drag.FRICTION,
+    "leading": drag.LEADING,
+    "slope": drag.SLOPE,
+    "speed": drag.SPEED,
+}
+BODIES = {"first": drag.FIRST, "last": drag.LAST}
+
 
 class Drag(Force):
-    """Drag on a `RodGroup` or `CoupledModel`."""
+    """Drag on a `RodGroup` or `CoupledModel`.
+
+    Parameters:
+
+        "drag.tangential", "drag.normal" [N s/m^2], "drag.rotational" [N s]
+                         of the edges of rods with viscous drag, per length; rotational drag of those with twist
+        "drag.lateral", "drag.friction", "drag.leading" [N/m], "drag.slope" (the tangent of `angle`), "drag.speed" [m/s]
+                         of the edges of rods in a granular medium
+        "drag.first", "drag.last" [N s/m]
+                         of bodies at the first and at the last node of the edges of rods with drag; `Scene.drag(nodes=...)` assigns
+                         the coefficient of a node to the edge that starts there, that of the last node to the last edge
+    """
 
     name = "drag"
+    parameters = VISCOUS | GRANULAR | BODIES
+    signed, positive = ("leading",), ("slope", "speed")
 
     def __init__(self, model, part, kernel, midpoint: bool):
         self.model, self.part, self.midpoint, self._resist = model, part, midpoint, kernel
         vector = wp.types.vector(part.dim, model.types.real)
         self.flow = wp.array(self._flow(0.0), dtype=vector, device=model.wp_device)
+
+    @staticmethod
+    def has(name: str, coefficients: np.ndarray, twisted) -> np.ndarray:
+        """Return the mask of edges that have a parameter (E,) from coefficients (rows, E), and the mask of edges with twist."""
+        granular = coefficients[drag.SPEED] > 0.0
+        chosen = (granular == (name in GRANULAR)) | (name in BODIES)
+        return chosen & twisted if name == "rotational" else chosen
+
+    @property
+    def coefficients(self) -> wp.array:
+        """Coefficients of edges, as rows of `kernels.forces.drag`."""
+        return self.part.coefficients[self.name]
 
     @property
     def kernels(self) -> list:
@@ -64,7 +99,7 @@ class RodGroupDrag(Drag):
         self._launch(
             self._resist,
             group.node_threads,
-            [before.x, before.v, before.theta, x if self.midpoint else before.x, x, group.drag, self.flow]
+            [before.x, before.v, before.theta, x if self.midpoint else before.x, x, self.coefficients, self.flow]
             + [group.mass, group.rotary, group.count, *islands.arrays],
             [mass, rotary, target_angle],
         )
@@ -96,7 +131,7 @@ class CoupledDrag(Drag):
     def __init__(self, model, midpoint: bool = False):
         coupled, host, device = model.coupled, model.coupled.host, model.wp_device
         super().__init__(model, coupled, drag.coupled_kernel(model.types.real), midpoint)
-        ends, angles, _ = host.drag
+        ends, angles = host.forced_edges
         places = np.stack([*ends, np.where(angles < 0, host.blocks, angles)], -1).ravel()
         starts, items = lists(places, host.blocks + 1)
 
@@ -115,7 +150,7 @@ class CoupledDrag(Drag):
             self._resist,
             coupled.worlds * coupled.blocks,
             [before.q, before.v, q if self.midpoint else before.q, q, coupled.mass, self.ends]
-            + [coupled.drag, self.starts, self.items, self.flow, load_scale, *islands.arrays]
+            + [self.coefficients, self.starts, self.items, self.flow, load_scale, *islands.arrays]
             + [coupled.blocks, coupled.host.nodes],
             [mass],
         )

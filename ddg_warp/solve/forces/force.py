@@ -1,15 +1,21 @@
 """Forces of a step on the nodes of a rod group or of the coupled system, beside elements and contact."""
 
+from typing import ClassVar
+
 
 class Force:
     """Force of a step on a `RodGroup` or on the `CoupledModel`.
 
     Attributes:
         name: name in parameters and reports.
+        parameters: rows of coefficients of edges, by name; `signed` may be negative, `positive` must not be zero.
         follows: True if the force depends on the iterate, see `Loads.apply`, while a solve takes that of its predictor.
     """
 
     name: str
+    parameters: ClassVar[dict[str, int]] = {}
+    signed: tuple[str, ...] = ()
+    positive: tuple[str, ...] = ()
     follows = False
 
     @property

@@ -1,8 +1,10 @@
 """List of the forces of a step."""
 
-from ddg_warp.solve.forces.drag import CoupledDrag, RodGroupDrag
+from ddg_warp.solve.forces.drag import CoupledDrag, Drag, RodGroupDrag
 from ddg_warp.solve.forces.force import Force
 from ddg_warp.solve.forces.loads import Loads
+
+WITH_PARAMETERS = (Drag,)  # classes of forces whose coefficients of edges have names
 
 
 def forces_of(model, part, midpoint: bool, control_loads: Loads | None = None) -> list[Force]:
@@ -11,5 +13,5 @@ def forces_of(model, part, midpoint: bool, control_loads: Loads | None = None) -
     if not result and (host.timed or host.followers):
         result.append(Loads(model, part, midpoint))
     if part is model.coupled:
-        return [*result, CoupledDrag(model, midpoint)] if host.drag else result
+        return [*result, CoupledDrag(model, midpoint)] if host.quadratic else result
     return [*result, RodGroupDrag(model, part, midpoint)] if part.kind.quadratic else result

@@ -17,7 +17,7 @@ from ddg_warp.kernels.elements import coupled_frames, element_path
 from ddg_warp.kernels.elements.coupled_element import coupled_storage
 from ddg_warp.kernels.stepping import time_step
 from ddg_warp.model.coupled_model import CoupledState
-from ddg_warp.scene import drag
+from ddg_warp.scene.edge_forces import HOLD, holds
 from ddg_warp.solve.collision.support_arcs import Arcs
 from ddg_warp.solve.equilibrium.tangent import Tangent
 from ddg_warp.solve.forces.control_loads import ControlledLoads, CoupledScale
@@ -53,15 +53,12 @@ class CoupledStep(StepDriver):
                     f"{name} = {value!r} is for uncoupled rods; with a coupled system it is {' or '.join(only)}"
                 )
         bare = ((host.mass <= 0.0) & ~host.fixed)[: host.nodes].any(1)
-        if host.drag:
-            ends, _, coefficients = host.drag
-            bare[ends[drag.holds(coefficients)]] = False
+        if host.quadratic:
+            ends, _ = host.forced_edges
+            bare[ends[holds(host.coefficients)]] = False
         bare = np.flatnonzero(bare)
         if bare.size:
-            raise SceneError(
-                f"{Tangent(model).parts[-1].where(3 * int(bare[0]))} is free and has no mass; "
-                "give the material a density, the section a mass_per_length, or the rod drag along and across"
-            )
+            raise SceneError(f"{Tangent(model).parts[-1].where(3 * int(bare[0]))} is free and has no mass; {HOLD}")
         preconditioner = coupled_preconditioner(model.coupled) if integrator.linear == "auto" else integrator.linear
         reuse = integrator.solver == "projective"
         if options.psd == "auto" and means.stiff and not reuse:
