@@ -25,7 +25,7 @@ class RodGroupState:
         frame: time-lagged reference frames (7, n, R): first director, tangent, reference twist; empty without twist.
         last: strains at this state (strains, n, R); empty without strain-rate damping.
         a: correction of the last solve to its predictor over the squared step (n, R) [m/s^2], for the warm start. Zero without a
-            last solve. With the midpoint rule, massless nodes with drag have accelerations from mean velocities of two steps.
+            last solve. With the midpoint rule, massless nodes have accelerations from mean velocities of two steps.
         alpha: correction of twist angles likewise (n, R) [rad/s^2]; empty without twist.
     """
 

@@ -43,7 +43,7 @@ def rest_strains(model, state=None, load: float = 1.0) -> dict[str, np.ndarray]:
 
     Args:
         model: open uncoupled rods with stretch and with bending and twist, or planar; supports must balance all loads.
-        state: the shape to keep; by default the rest state. Velocities and drag are ignored.
+        state: the shape to keep; by default the rest state. Velocities are ignored.
         load: the load parameter of statics, which scales gravity and loads.
 
     Returns:

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import log, pi
+from typing import ClassVar
 
 import numpy as np
 
@@ -261,12 +262,16 @@ class Laws:
 
     Attributes:
         given: the laws; of_rods: index of the law of every rod in `given` (R,), -1 without a law.
+        radius_powers: powers of the section radius a that `Viscous` takes, for small changes, by name of the coefficient.
+        slender: coefficients k mu / (ln(S / a) + constant), whose inverses are linear in ln a.
 
     Raises:
         SceneError: a rod has two.
     """
 
     name = "drag"
+    radius_powers: ClassVar[dict[str, int]] = {"tangential": 1, "normal": 1, "rotational": 2}
+    slender = ("tangential", "normal")
 
     def __init__(self, scene):
         self._drags, self.of_rods = scene.drags, np.full(scene.rod_count, -1)
@@ -298,6 +303,17 @@ class Laws:
                 rows[:, -1, LAST] = bodies[:, -1]
             result[np.ix_(chosen, real)] = rows
         return result
+
+    def radius_sensitivity(self, name: str, rods: list[int]) -> np.ndarray:
+        """Return the sensitivity of a coefficient to ln a, of rods; 0 if the radius of the law is given.
+
+        Slender: -d(1 / zeta) / d(ln a) [m^2 / N s]. Others, proportional to a power of a: 1.
+        """
+        k = {"tangential": 2.0 * pi, "normal": 4.0 * pi}.get(name)
+        laws_of_rods = [self.given[self.of_rods[rod]] for rod in rods]
+        sized = (law for law in laws_of_rods if isinstance(law, Viscous) and law.radius is None)
+        sensitivity = {law: 1.0 if k is None else 1.0 / (k * law.viscosity) for law in sized}
+        return np.array([sensitivity.get(law, 0.0) for law in laws_of_rods])
 
     @staticmethod
     def check(scene) -> None:

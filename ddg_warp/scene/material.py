@@ -53,8 +53,8 @@ class Stiffness:
         GJ: twisting stiffness [N m^2].
         mass_per_length: rho A [kg/m].
         rotary_inertia: rho (I1 + I2) [kg m], inertia about the tangent per length.
-        radius: of the rod in contact, in `Viscous` drag, and of the displayed tube [m]; None if unknown. Contact and viscous drag
-            require it; tubes have the radius `DRAWN`, 1 mm, by default, which `report` states.
+        radius: of the rod in contact, in `Viscous`, and of the displayed tube [m]; None if unknown. Contact and `Viscous` require
+            it; tubes have the radius `DRAWN`, 1 mm, by default, which `report` states.
         viscosity: strain-rate damping [s], as in `Material`.
         area: of the section [m^2], which a magnetisation needs; 0 if unknown.
     """

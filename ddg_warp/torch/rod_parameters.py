@@ -1,17 +1,16 @@
 """Module of learned rod material and section parameters."""
 
-from math import pi
-
 import numpy as np
 import torch
 import warp as wp
 
 from ddg_warp.errors import SceneError
-from ddg_warp.scene.drag import Laws, Viscous
+from ddg_warp.scene import edge_forces
 from ddg_warp.torch import contact_parameters, named_parameters
 from ddg_warp.torch.positive_parameters import parameter_key, requested, usual_values
 
 NAMES = ("stretching", "bending", "twisting", "density", "radius")
+LAWS = {f"{laws.name}.{name}": (laws, name) for laws in edge_forces.LAWS for name in laws.radius_powers}
 
 
 class RodParameters(torch.nn.Module):
@@ -22,11 +21,10 @@ class RodParameters(torch.nn.Module):
         stretching, bending, twisting   c EA; c EI in both directions; c GJ
         density                         c rho: masses and rotary inertia; masses of `Scene.add_mass` stay
         radius                          all lengths of the section: c^2 EA, c^4 EI, c^4 GJ, c^2 of masses, c^4 of rotary inertia,
-            drag
-                                        by the radius in `Viscous`, c of the radius in contact, 1 / c of the curvature at
+                                        coefficients of `Viscous`, c of the radius in contact, 1 / c of the curvature at
                                         which the law of a `Ribbon` changes
 
-    Drag coefficients and contact radii that were set explicitly stay. Rods have no radius to learn if the section is a `Stiffness`,
+    Coefficients and contact radii that were set explicitly stay. Rods have no radius to learn if the section is a `Stiffness`,
     if they have constitutive laws of their own, or if they are magnetised. Rod-shell coupling stays unchanged.
 
     Args:
@@ -61,7 +59,7 @@ class RodParameters(torch.nn.Module):
             self.register_buffer(parameter_key(parameter), usual_values(simulator, parameter))
         if "rod.mass" in self._powers:
             self.register_buffer("_sections", torch.tensor(named_parameters.of_sections(model, "rod.mass"), **made))
-        for parameter in ("drag.tangential", "drag.normal", "drag.rotational", contact_parameters.RADIUS):
+        for parameter in (*LAWS, contact_parameters.RADIUS):
             if parameter in self._powers:
                 self.register_buffer(
                     f"{parameter_key(parameter)}_share", torch.tensor(_weight(model, parameter), **made)
@@ -75,16 +73,12 @@ class RodParameters(torch.nn.Module):
             exponent = sum(power * logarithms[name] for name, power in powers.items() if name in logarithms)
             if parameter == "rod.mass":
                 result[parameter] = usual + self._sections * torch.expm1(exponent)
-            elif parameter in ("drag.rotational", contact_parameters.RADIUS):  # 4 pi mu a^2, and a
-                result[parameter] = usual * (
-                    1.0 + getattr(self, f"{parameter_key(parameter)}_share") * torch.expm1(exponent)
-                )
-            elif parameter.startswith("drag."):  # k mu / (ln(S / a) + constant)
-                result[parameter] = usual / (
-                    1.0 - usual * getattr(self, f"{parameter_key(parameter)}_share") * exponent
-                )
-            else:
+            elif (share := getattr(self, f"{parameter_key(parameter)}_share", None)) is None:
                 result[parameter] = usual * exponent.exp()
+            elif parameter in LAWS and LAWS[parameter][1] in LAWS[parameter][0].slender:
+                result[parameter] = usual / (1.0 - usual * share * exponent)
+            else:
+                result[parameter] = usual * (1.0 + share * torch.expm1(exponent))
         return result
 
 
@@ -104,32 +98,27 @@ def _powers(model) -> dict[str, dict[str, int]]:
         powers["rod.mass"] = {"density": 1, "radius": 2}
         if named_parameters.array_views(model, "rod.inertia")[1]:
             powers["rod.inertia"] = {"density": 1, "radius": 4}
-    for parameter, power in (("drag.tangential", 1), ("drag.normal", 1), ("drag.rotational", 2)):
+    for parameter, (laws, name) in LAWS.items():
         if named_parameters.array_views(model, parameter)[1] and _weight(model, parameter).any():
-            powers[parameter] = {"radius": power}
+            powers[parameter] = {"radius": laws.radius_powers[name]}
     if contact_parameters.sized(model, shells=False):
         powers[contact_parameters.RADIUS] = {"radius": 1}
     return powers
 
 
 def _weight(model, name: str) -> np.ndarray:
-    """Return the sensitivity of drag coefficients of edges, or contact radii of bodies, to the section radius a.
+    """Return the sensitivity of coefficients of edges, or contact radii of bodies, to the section radius a; 0 if set explicitly.
 
-    Axial and normal drag: d(1 / zeta) / d(-ln a) [m^2 / N s]. Rotational drag, proportional to a^2, and contact radii: 1.
-    Values that were set explicitly: 0.
+    Contact radii: 1. Coefficients: see `edge_forces`.
     """
     if name == contact_parameters.RADIUS:
         return np.isin(
             np.arange(named_parameters.array_views(model, name)[0]),
             list(contact_parameters.sized(model, shells=False)),
         )
-    laws = Laws(model.scene)
+    laws, parameter = LAWS[name]
     rods = [model.order.edge(row)[1] for row in named_parameters.elements(model, name)]
-    laws_of_edges = [laws.given[laws.of_rods[rod]] for rod in rods]
-    k = {"drag.tangential": 2.0 * pi, "drag.normal": 4.0 * pi}.get(name)
-    sized = (law for law in laws_of_edges if isinstance(law, Viscous) and law.radius is None)
-    sensitivity = {law: 1.0 if k is None else 1.0 / (k * law.viscosity) for law in sized}
-    return np.array([sensitivity.get(law, 0.0) for law in laws_of_edges])
+    return laws(model.scene).radius_sensitivity(parameter, rods)
 
 
 def _require_sizes(scene) -> None:

@@ -1,1 +1,1 @@
-"""Non-elastic forces: drag, follower loads, control loads, prescribed motion, gyroscopic couples."""
+"""Non-elastic forces, and prescribed motion."""

@@ -1,1 +1,1 @@
-"""Non-elastic forces as launches of a step: drag, loads, control loads, prescribed motion, gyroscopic couples."""
+"""Non-elastic forces and prescribed motion, as launches of a step."""

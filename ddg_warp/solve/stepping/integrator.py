@@ -67,7 +67,7 @@ class Integrator:
         retry_limit: consecutive retries of a failed step: first a cold start, then half the step, and so on, down to
             2^-(retry_limit / 2) of the step.
         energy_bound: largest energy drift of the midpoint rule, per uncoupled rod and per world of the coupled system. It is a fraction
-            of the largest kinetic and elastic energy so far plus the work of damping and drag; None for no bound. Work of loads and
+            of the largest kinetic and elastic energy so far plus the dissipated work; None for no bound. Work of loads and
             supports and the rounding floor do not count. A step beyond the bound is retried at half length, and then fails with the
             outcome `energy_drift`. The count starts at a state from outside (a resumed run counts from zero). Resolved motion
             conserves the energy to about 1e-3, while an unstable run multiplies it within some steps: the default of a tenth lies
@@ -85,7 +85,7 @@ class Integrator:
         watched_wrenches: wrenches of the last step on the device; None unless `watch_wrenches` was called.
 
     Raises:
-        SceneError: a free node has neither mass nor drag along and across its rod; the scheme is unknown, or implicit Euler has an
+        SceneError: a free node has no mass, and no force in all directions; the scheme is unknown, or implicit Euler has an
             energy bound.
     """
 
@@ -461,7 +461,7 @@ class Integrator:
     def wrenches(self) -> list[Reaction]:
         """Return the force and moment that every support, grip and obstacle exerted in the last step. Reads from the device.
 
-        They are ordered as in `Model.reactions`, and hold inertia, damping, drag and loads at the support; see `Wrenches`.
+        They are ordered as in `Model.reactions`, and hold inertia, damping and all forces at the support; see `Wrenches`.
 
         Raises:
             SceneError: `watch_wrenches` was not called before the step.

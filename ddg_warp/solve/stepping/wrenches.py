@@ -45,7 +45,7 @@ class Wrenches:
     """Wrenches of the last step of an integrator, on the device.
 
     Supports are ordered as in `Model.reactions`. Forces are means over the step, over its substeps too. They balance the momentum
-    exactly: its change over the step length is the sum of weights, loads, drag, mass damping and wrenches. Moments do so about the
+    exactly: its change over the step length is the sum of all forces, mass damping and wrenches. Moments do so about the
     positions at the end of each solve: the end of the step for implicit Euler, its middle for the midpoint rule.
 
     Gyroscopic couples on fixed nodes are left out. A failed world has the wrenches of its accepted substeps.
