@@ -119,7 +119,7 @@ class CoupledStepAdjoint:
         self._midpoint = midpoint
         self.predictor = CoupledPredictor.of(model, coupled, motion, scheme)
         self._shares = CoupledAssembly(model)
-        self.forces = force_adjoints(model, coupled, midpoint, self._shares.gather) if scheme else []
+        self.forces = force_adjoints(model, coupled, midpoint) if scheme else []
         self._quadratic = quadratic_of(self.forces)
         self.contact = ContactAdjoint(coupled) if host.contact_parameters else None
         self.solve = CoupledLinearSolve(

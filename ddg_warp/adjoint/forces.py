@@ -8,6 +8,7 @@ from scipy import sparse
 
 from ddg_warp import device_arrays
 from ddg_warp.kernels.adjoint import drag, follower_loads
+from ddg_warp.kernels.adjoint.coupled_assembly import gather_kernels
 from ddg_warp.kernels.core.inertia import block_inertia
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.forces.drag import ROWS
@@ -43,11 +44,11 @@ class ForceCotangents:
     by_predicted: wp.array | None
 
 
-def force_adjoints(model, part, midpoint: bool, gather=None) -> list:
-    """Return the adjoints of the forces on a rod group or on the coupled system; `gather`: see `CoupledDragAdjoint`."""
+def force_adjoints(model, part, midpoint: bool) -> list:
+    """Return the adjoints of the forces on a rod group or on the coupled system."""
     result = [FollowerAdjoint(model, part, midpoint)] if part.host.followers else []
     if part is model.coupled:
-        return [*result, CoupledDragAdjoint(model, part, midpoint, gather)] if part.host.quadratic else result
+        return [*result, CoupledDragAdjoint(model, part, midpoint)] if part.host.quadratic else result
     return [*result, RodDragAdjoint(model, part, midpoint)] if part.kind.quadratic else result
 
 
@@ -157,18 +158,16 @@ class RodDragAdjoint:
 class CoupledDragAdjoint:
     """VJP of drag on the coupled system; further attributes as `RodDragAdjoint`.
 
-    Args:
-        gather: kernel that assembles contributions of edges to dof blocks.
-
     Attributes:
         inertia: inertia and drag of the dof blocks in the current solve (worlds, N), written by `resist`.
     """
 
     quadratic = True
 
-    def __init__(self, model, coupled, midpoint: bool, gather):
+    def __init__(self, model, coupled, midpoint: bool):
         real, device, (ends, angles) = model.types.real, coupled.device, coupled.host.forced_edges
-        self.coupled, self.force, self._gather = coupled, CoupledDrag(model, midpoint), gather
+        self.coupled, self.force = coupled, CoupledDrag(model, midpoint)
+        self._gather, *_ = gather_kernels(real)
         self._edges, self._nodes = drag.coupled_kernels(real, midpoint)
         self._ends, self._angles = (
             wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device) for values in (ends.T, angles)

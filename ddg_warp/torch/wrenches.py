@@ -5,7 +5,6 @@ A wrench is an explicit function of the states at both ends of a step of implici
 continue through the step.
 """
 
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,11 +15,10 @@ import warp as wp
 from ddg_warp.compile.support_dofs import NormalMoments, SupportDofs, matches
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.adjoint.element_forces import force_kernels
-from ddg_warp.kernels.forces import drag
-from ddg_warp.scene.drag import flow_at
 from ddg_warp.solve.forces.control_loads import loaded_rows
 from ddg_warp.solve.stepping.wrenches import coupled_elements_at, elements_at, support_count
-from ddg_warp.torch.parameter_storage import TermParameterView
+from ddg_warp.torch.parameter_storage import ArrayParameterView, TermParameterView
+from ddg_warp.torch.quadratic_forces import QuadraticForces, QuadraticPotential, torch_stream
 from ddg_warp.torch.state_layout import view
 
 
@@ -88,16 +86,9 @@ def _launch(term, index: int, inputs, outputs) -> None:
 
     count = len(inputs[0])
     if count:
-        with _torch_stream(inputs[0]):
+        with torch_stream(inputs[0]):
             device = wp.device_from_torch(inputs[0].device)
             wp.launch(kernel, count, [*map(array, inputs)], [*map(array, outputs)], device=device)
-
-
-def _torch_stream(like: torch.Tensor):
-    """Return a context for Warp launches on torch's stream."""
-    if not like.is_cuda:
-        return nullcontext()
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(like.device)))
 
 
 class ContactForces(torch.autograd.Function):
@@ -110,7 +101,7 @@ class ContactForces(torch.autograd.Function):
     def forward(ctx, model, rate, q):
         ctx.model, ctx.rate = model, rate
         ctx.save_for_backward(q)
-        with _torch_stream(q):
+        with torch_stream(q):
             _evaluate_contact(model, rate, q)
             return view(model.touch.terms.forces).clone()
 
@@ -118,7 +109,7 @@ class ContactForces(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, cotangent):
         (q,), model = ctx.saved_tensors, ctx.model
-        with _torch_stream(q):
+        with torch_stream(q):
             x = _evaluate_contact(model, ctx.rate, q)
             v, result = _blocks(cotangent), wp.zeros_like(x)
             model.touch.terms.product(v, result, x)
@@ -190,7 +181,7 @@ class Wrenches:
             for place, values in zip(self.engine.tables.of(name)[1], tensors, strict=True):
                 if isinstance(place, TermParameterView):
                     parameter_tensors[place.index, place.is_rod_group, place.name] = values
-                elif getattr(place, "weighs", False):
+                elif isinstance(place, ArrayParameterView):
                     summed.setdefault((place.index, place.is_rod_group, place.key[1]), []).append((place, values))
                 else:
                     raise SceneError(f"wrenches: no gradient goes through wrenches by {name}; leave it out")
@@ -222,6 +213,7 @@ class _Part:
         self._support = self._long(dofs.support)
         self._share, self._first = self._numbers(dofs.share), self._long(dofs.first)
         self._nodes, self._angles = np.flatnonzero(~dofs.is_angle), np.flatnonzero(dofs.is_angle)
+        self._potential = QuadraticPotential(engine.model, part) if part.host.coefficients else None
 
     def _long(self, values) -> torch.Tensor:
         return torch.as_tensor(np.array(values, np.int64), device=self._device)
@@ -287,9 +279,9 @@ class _Part:
         contributions = elements[local[None], column[None] + self._worlds * self._columns]
         reaction = elements.new_zeros((worlds, count, 3)).index_add(1, targets, contributions)
         reaction = reaction - self._loads(time, controls)
-        if self.resisted:
-            for some, resistance in self._drag(states, dt, time):
-                reaction = reaction.index_add(1, some, resistance)
+        if self._potential:
+            for some, values in self._quadratic_forces(states, parameter_tensors, (time, dt)):
+                reaction = reaction.index_add(1, some, values)
         contact = self._contact(after)
         if contact is not None:
             reaction = reaction - contact[self._index(self.dofs.place)]
@@ -323,37 +315,19 @@ class _Part:
         """Return contact forces on all dof blocks; None without contact."""
         return None
 
-    @property
-    def resisted(self) -> bool:
-        """True with drag."""
+    def _quadratic_forces(self, states, parameter_tensors, step: tuple[float, float]):
+        """Yield entries, and forces against the quadratic potential there (worlds, n, 3)."""
         raise NotImplementedError
 
-    def _edges(self) -> tuple:
-        """Return edges with drag: indices of both nodes and of angles (-1 without), and coefficients (rows, n)."""
-        raise NotImplementedError
-
-    def _drag(self, states, dt: float, time: float):
-        """Yield entries, and the resistance of drag there (worlds, n, 3); see `kernels.forces.drag`."""
-        before, after = states
-        first, last, angles, p = self._edges()
-        x, v = self._flat(before, "x"), self._flat(before, "v")
-        flow = self._numbers(flow_at(self.model.scene, time))
-        edge = x[last] - x[first]
-        half = _half_resistance(edge, 0.5 * (v[first] + v[last]) - flow, p)
-        one = torch.eye(3, dtype=x.dtype, device=x.device)
-        D = x.new_zeros((len(x), 3, 3))
-        D = D.index_add(0, first, half + one * p[drag.FIRST][:, None, None])
-        D = D.index_add(0, last, half + one * p[drag.LAST][:, None, None])
-        nodes = self._index(self.dofs.place[self._nodes])
-        moved = self._flat(after, "x")[nodes] - x[nodes] - flow * dt
-        yield self._long(self._nodes), torch.einsum("wnij,wnj->wni", D[nodes], moved) / dt
-        if len(self._angles):
-            theta, twisted = self._flat(before, "theta"), torch.nonzero(angles >= 0).flatten()
-            spin = p[drag.ROTATIONAL] * edge.norm(dim=-1) / dt
-            spin = x.new_zeros(len(theta)).index_add(0, angles[twisted], spin[twisted])
-            places = self._index(self.dofs.place[self._angles])
-            turned = self._flat(after, "theta")[places] - theta[places]
-            yield self._long(self._angles), spin[places][..., None] * turned
+    def _coefficients(self, key: tuple, parameter_tensors) -> torch.Tensor:
+        """Return the coefficients of the force with a quadratic potential, in storage layout (rows, ...)."""
+        force, array = self._potential.force, self.part.host.coefficients[self._potential.force.name]
+        values = list(self._numbers(np.tile(array, len(self._worlds))))
+        for name, row in force.parameters.items():
+            replacement = parameter_tensors.get((*key, f"{force.name}.{name}"))
+            if replacement is not None:
+                values[row] = replacement.reshape(values[row].shape)
+        return torch.stack(values)
 
     def _parameters(self, term, key: tuple, parameter_tensors, stored, pick) -> list[torch.Tensor]:
         """Return rest measure and parameters (n,) of elements; `pick` selects them from an array as in `parameter_tensors`."""
@@ -364,28 +338,6 @@ class _Part:
             values = parameter_tensors.get((index, is_rod_group, name))
             result.append(pick(self._numbers(stored(name)) if values is None else values))
         return result
-
-
-def _half_resistance(e: torch.Tensor, v: torch.Tensor, p: torch.Tensor) -> torch.Tensor:
-    """Return the resistance of half an edge (n, 3, 3) [N s/m]; see `kernels.forces.drag.edge_function`."""
-    length = e.norm(dim=-1)
-    t = e / length[:, None]
-    tangential, normal, least, slope = (p[row] for row in (drag.TANGENTIAL, drag.NORMAL, drag.SPEED, drag.SLOPE))
-    granular = least > 0.0
-    if granular.any():
-        least = torch.where(granular, least, 1.0)
-        along = (v * t).sum(-1)
-        speed = torch.sqrt((v * v).sum(-1) + least**2)
-        sine = (v - t * along[:, None]).norm(dim=-1) / speed
-        root = torch.sqrt(slope**2 + sine**2)
-        leading = (1.0 - sine / root) / torch.sqrt(along**2 + least**2)
-        across = normal + p[drag.LATERAL] / (root * speed)
-        forward = tangential + torch.relu(p[drag.FRICTION] / speed + p[drag.LEADING] * leading)
-        normal, tangential = torch.where(granular, across, normal), torch.where(granular, forward, tangential)
-    one = torch.eye(3, dtype=e.dtype, device=e.device)
-    outer = t[:, :, None] * t[:, None]
-    total = one * normal[:, None, None] + outer * (tangential - normal)[:, None, None]
-    return total * (0.5 * length)[:, None, None]
 
 
 def _local_forces(measure, f: torch.Tensor, dim: int) -> torch.Tensor:
@@ -436,8 +388,11 @@ class _Rods(_Part):
         return (self._long(k) * self.part.columns + self._long(column))[None] + self._worlds * self.part.rods
 
     def _flat(self, state: dict, name: str) -> torch.Tensor:
-        values = state[f"{self.number}/{name}"]
-        if name in ("theta", "omega"):
+        return self._spatial(state[f"{self.number}/{name}"], name in ("theta", "omega"))
+
+    def _spatial(self, values: torch.Tensor, is_angle: bool) -> torch.Tensor:
+        """Return vectors in space of nodes (n, R, dim), or of angles (n, R)."""
+        if is_angle:
             values = values.reshape(-1)
             return torch.stack([values, 0.0 * values, 0.0 * values], -1)
         values = values.reshape(-1, self.part.dim)
@@ -453,24 +408,21 @@ class _Rods(_Part):
     def _lagged_tangents(self, before: dict) -> torch.Tensor:
         return before[f"{self.number}/frame"][3:6].reshape(3, -1).T
 
-    @property
-    def resisted(self) -> bool:
-        """True with drag."""
-        return self.part.kind.quadratic
-
-    def _edges(self) -> tuple:
-        """Return edges with drag, see `_Part`."""
-        group = self.part
-        k, column = (
-            values.ravel() for values in np.meshgrid(*map(np.arange, (group.nodes, group.rods)), indexing="ij")
+    def _quadratic_forces(self, states, parameter_tensors, step: tuple[float, float]):
+        kind = self.part.kind
+        (x0, v0, theta0), (x, _, theta) = (
+            [
+                state[f"{self.number}/{name}"] if kind.twist or name != "theta" else self._numbers([[0.0]])
+                for name in ("x", "v", "theta")
+            ]
+            for state in states
         )
-        count, closed = group.host.count[column], group.kind.closed
-        some = k < count - (0 if closed else 1)
-        k, column = k[some], column[some]
-        following = np.where(k + 1 == count[some], 0, k + 1)
-        first, last = (self._index(node * group.rods + column).reshape(-1) for node in (k, following))
-        p = view(group.coefficients["drag"]).reshape(drag.ROWS, -1)[:, first]
-        return first, last, first if group.kind.twist else first * 0 - 1, p
+        p = self._coefficients((self.number, True), parameter_tensors)
+        force, moment = QuadraticForces.apply(self._potential, step, x0, v0, theta0, x, theta, p)
+        force = self._spatial(force, False)
+        yield self._long(self._nodes), force[self._index(self.dofs.place[self._nodes])]
+        if kind.twist:
+            yield self._long(self._angles), self._spatial(moment, True)[self._index(self.dofs.place[self._angles])]
 
     def _element_forces(self, states, parameter_tensors, dt: float) -> torch.Tensor:
         (before, after), group, kind = states, self.part, self.part.kind
@@ -573,17 +525,12 @@ class _Coupled(_Part):
         start, rest = coupled.angle_start, coupled.blocks - coupled.angle_start - coupled.edges
         return torch.nn.functional.pad(tangents, (0, 0, start, rest)).reshape(-1, 3)
 
-    @property
-    def resisted(self) -> bool:
-        """True with drag."""
-        return self.part.host.quadratic
-
-    def _edges(self) -> tuple:
-        """Return edges with drag, see `_Part`."""
-        ends, angles = self.part.host.forced_edges
-        first, last, of_angles = (self._index(values).reshape(-1) for values in (*ends, angles))
-        free = self._long(angles < 0).repeat(len(self._worlds)) > 0
-        return first, last, torch.where(free, -1, of_angles), view(self.part.coefficients["drag"])
+    def _quadratic_forces(self, states, parameter_tensors, step: tuple[float, float]):
+        before, after = states
+        p, angles = self._coefficients((-1, False), parameter_tensors), self._numbers([[0.0]])
+        values = before["net/q"], before["net/v"], angles, after["net/q"], angles, p
+        force, _ = QuadraticForces.apply(self._potential, step, *values)
+        yield self._long(np.arange(len(self.dofs))), force[self._index(self.dofs.place)]
 
     def _contact(self, after: dict) -> torch.Tensor | None:
         """Return contact forces on all dof blocks; None without contact."""

@@ -76,7 +76,7 @@ def test_tensors_are_the_wrenches_of_the_integrator(device, name):
 
 @pytest.mark.parametrize("name", [*SCENES, "gripped"])
 def test_gradients_against_differences(device, name):
-    """Gradients by the start state, a stiffness, gravity, forces and poses, through the step."""
+    """Gradients by the start state, a stiffness, masses, coefficients of drag, gravity, forces and poses, through the step."""
     simulator = simulated(name, device)
     before = started(simulator)
     random = np.random.default_rng(0)
@@ -99,7 +99,9 @@ def test_gradients_against_differences(device, name):
     masses = [mass for mass in ("rod.mass", "shell.mass") if mass in before.engine.tables.names()]
     if name == "oblique":  # velocities off a skew support would leave its plane
         del inputs["velocities"]
-    inputs["mass"] = torch.zeros_like(inputs["stiffness"])
+    coefficients = [each for each in before.engine.tables.names() if each.startswith("drag.")]
+    for each in ("mass", *coefficients):
+        inputs[each] = torch.zeros_like(inputs["stiffness"])
     weights = {}
 
     def loss(**moved):
@@ -111,6 +113,8 @@ def test_gradients_against_differences(device, name):
         parameters = {term: stiffness * (1.0 + moved["stiffness"])}
         for mass in masses:
             parameters[mass] = simulator.parameter(mass) * (1.0 + moved["mass"])
+        for each in coefficients:
+            parameters[each] = simulator.parameter(each) + 0.05 + 0.1 * moved[each]
         controls = {
             "gravity": moved["gravity"] + torch.tensor(model.scene.gravity, dtype=torch.float64),
             "forces": moved["forces"],
@@ -140,7 +144,7 @@ def test_gradients_against_differences(device, name):
     }
     for key, value in inputs.items():
         direction = torch.as_tensor(random.normal(size=value.shape), device=value.device)
-        step = sizes[key]
+        step = sizes.get(key, 1e-3)
         with torch.no_grad():
             ends = [loss(**(inputs | {key: value + sign * step * direction})) for sign in (1.0, -1.0, 2.0, -2.0)]
         difference = float((8.0 * (ends[0] - ends[1]) - (ends[2] - ends[3])) / (12.0 * step))

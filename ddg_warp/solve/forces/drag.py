@@ -26,6 +26,9 @@ BODIES = {"first": drag.FIRST, "last": drag.LAST}
 class Drag(Force):
     """Drag on a `RodGroup` or `CoupledModel`.
 
+    Attributes:
+        coefficients: of edges, as rows of `kernels.forces.drag`; initially the array of the model.
+
     Parameters:
 
         "drag.tangential", "drag.normal" [N s/m^2], "drag.rotational" [N s]
@@ -43,7 +46,7 @@ class Drag(Force):
 
     def __init__(self, model, part, kernel, midpoint: bool):
         self.model, self.part, self.midpoint, self._resist = model, part, midpoint, kernel
-        vector = wp.types.vector(part.dim, model.types.real)
+        self.coefficients, vector = part.coefficients[self.name], wp.types.vector(part.dim, model.types.real)
         self.flow = wp.array(self._flow(0.0), dtype=vector, device=model.wp_device)
 
     @staticmethod
@@ -52,11 +55,6 @@ class Drag(Force):
         granular = coefficients[drag.SPEED] > 0.0
         chosen = (granular == (name in GRANULAR)) | (name in BODIES)
         return chosen & twisted if name == "rotational" else chosen
-
-    @property
-    def coefficients(self) -> wp.array:
-        """Coefficients of edges, as rows of `kernels.forces.drag`."""
-        return self.part.coefficients[self.name]
 
     @property
     def kernels(self) -> list:
@@ -71,11 +69,11 @@ class Drag(Force):
     def _flow(self, t: float) -> np.ndarray:
         return flow_at(self.model.scene, t)[None, list(self.part.host.axes)]
 
-    def _over_a_second(self) -> Islands:
-        """Return islands with the inertia and drag coefficients of a step of one second."""
+    def _islands(self, rate: float) -> Islands:
+        """Return islands with the inverse length of a solve."""
         islands = Islands(self.part.columns, self.model.types.real, self.model.wp_device)
         islands.inertia_coefficient.fill_(1.0)
-        islands.inverse_step.fill_(1.0)
+        islands.inverse_step.fill_(rate)
         return islands
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
@@ -106,11 +104,15 @@ class RodGroupDrag(Drag):
 
     def at(self, data, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Return inertia and drag (node, column) of a state at t over a second, and the flow (dim,)."""
+        self.upload(t, t)
+        return device_arrays.download(self.inertia(data, 1.0)), self.flow.numpy()[0].astype(float)
+
+    def inertia(self, data, rate: float) -> wp.array:
+        """Return inertia and drag [node][column] of a solve of length 1 / `rate` from a state."""
         group, real, device = self.part, self.model.types.real, self.model.wp_device
         mass = device_arrays.allocate((group.nodes, group.columns), rod_layout.inertia_type(group.kind, real), device)
-        self.upload(t, t)
-        self.resist(data, data.x, mass, wp.zeros_like(data.theta), wp.clone(data.theta), self._over_a_second())
-        return device_arrays.download(mass), self.flow.numpy()[0].astype(float)
+        self.resist(data, data.x, mass, wp.zeros_like(data.theta), wp.clone(data.theta), self._islands(rate))
+        return mass
 
     def rates(self, data, lead: float) -> tuple[np.ndarray, np.ndarray]:
         """Return rates of nodes and edges (node, column), of massless dofs extrapolated by `lead` [s]."""
@@ -157,13 +159,18 @@ class CoupledDrag(Drag):
 
     def at(self, state, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Return inertia and drag (world, block) of a state at t over a second, and the flow (blocks, 3)."""
-        coupled, device = self.part, self.model.wp_device
-        mass = wp.zeros((coupled.worlds, coupled.blocks), dtype=block_inertia(coupled.real), device=device)
+        coupled = self.part
         self.upload(t, t)
-        self.resist(state, state.q, mass, coupled.still, self._over_a_second())
         flow = np.zeros((coupled.blocks, 3))
         flow[: coupled.host.nodes] = self.flow.numpy()[0]
-        return mass.numpy(), flow
+        return self.inertia(state, 1.0).numpy(), flow
+
+    def inertia(self, state, rate: float) -> wp.array:
+        """Return inertia and drag [world][block] of a solve of length 1 / `rate` from a state."""
+        coupled, device = self.part, self.model.wp_device
+        mass = wp.zeros((coupled.worlds, coupled.blocks), dtype=block_inertia(coupled.real), device=device)
+        self.resist(state, state.q, mass, coupled.still, self._islands(rate))
+        return mass
 
     def rates(self, state, lead: float) -> np.ndarray:
         """Return rates of dof blocks (world, block), of massless dofs extrapolated by `lead` [s]."""
