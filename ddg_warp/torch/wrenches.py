@@ -138,7 +138,6 @@ def without_gradient(engine) -> str:
         "the midpoint rule": engine.midpoint,
         "friction": contact is not None and contact.has_friction,
         "gyroscopic couples": engine.integrator.gyroscopic,
-        "a magnetic field": model.magnetic,
         "shell normals that a grip turns": model.coupled is not None
         and any(model.motions[i] in model.grips for part in model.coupled.sets for i in part.turning[:, 2]),
         "follower loads on supports": any(
@@ -266,14 +265,14 @@ class _Part:
         usual = self._numbers(self.model.scene.gravity)[None]
         return controls.get("gravity", usual).expand(len(self._worlds), 3)[:, None]
 
-    def _element_forces(self, states, parameter_tensors, dt: float) -> torch.Tensor:
+    def _element_forces(self, states, parameter_tensors, controls: dict, dt: float) -> torch.Tensor:
         """Return forces of the listed elements by local node (rows, worlds columns, 3)."""
         raise NotImplementedError
 
     def __call__(self, states, parameter_tensors, controls, dt: float, time: float):
         """Yield supports, forces, points of attack and further moments (worlds, n, 3)."""
         before, after = states
-        elements = self._element_forces(states, parameter_tensors, dt)
+        elements = self._element_forces(states, parameter_tensors, controls, dt)
         targets, column, local = self._items
         count, worlds = len(self.dofs), len(self._worlds)
         contributions = elements[local[None], column[None] + self._worlds * self._columns]
@@ -424,7 +423,7 @@ class _Rods(_Part):
         if kind.twist:
             yield self._long(self._angles), self._spatial(moment, True)[self._index(self.dofs.place[self._angles])]
 
-    def _element_forces(self, states, parameter_tensors, dt: float) -> torch.Tensor:
+    def _element_forces(self, states, parameter_tensors, controls: dict, dt: float) -> torch.Tensor:
         (before, after), group, kind = states, self.part, self.part.kind
         x = after[f"{self.number}/x"].reshape(-1, kind.dim)
         places, worlds = self._along, len(self._worlds)
@@ -539,7 +538,7 @@ class _Coupled(_Part):
         q = after["net/q"]
         return ContactForces.apply(self.model, after.get("net/rate", q.new_zeros(0)), q)
 
-    def _element_forces(self, states, parameter_tensors, dt: float) -> torch.Tensor:
+    def _element_forces(self, states, parameter_tensors, controls: dict, dt: float) -> torch.Tensor:
         (before, after), coupled, worlds = states, self.part, len(self._worlds)
         q, host = after["net/q"], self.part.host
         if host.spins:
@@ -569,7 +568,12 @@ class _Coupled(_Part):
                 s.append(before[f"net/lag_{index}"][:, element])
             if measure.data_size:
                 data = after.get(f"net/data_{index}")
-                s.append(view(part.data)[:, self._long(np.tile(listed, worlds))] if data is None else data[:, element])
+                data = view(part.data)[:, self._long(np.tile(listed, worlds))] if data is None else data[:, element]
+                if measure.field and "field" in controls:  # whose values the data of the state have
+                    more = (controls["field"] - controls["field"].detach()).T.repeat_interleave(len(listed), 1)
+                    above, below = measure.data_size - measure.field, measure.field - len(more)
+                    data = data + torch.nn.functional.pad(more, (0, 0, above, below))
+                s.append(data)
             s = torch.cat(s).T if s else local.new_zeros((len(local), 1))
             w, *p = self._parameters(
                 term,

@@ -30,6 +30,16 @@ def joined_and_dragged(scene):
     scene.drag([0], tangential=0.3, normal=0.8, rotational=1e-3)
 
 
+def magnetised(scene):
+    """Add two magnetised rods, which attract each other, in a field with a gradient."""
+    for shift in (0.0, 0.15):
+        rod = scene.add_rod(line((0, shift, 0), (0.5, shift, 0.1)), section=SECTION, material=RUBBER)
+        scene.clamp_end(rod)
+        scene.magnetize(rod, (2e4, 1e4, 0.0))
+    scene.magnetic_field(lambda t: (0.0, 0.01 + t, 0.02), gradient=np.diag([1e-2, 1e-2, -2e-2]))
+    scene.add_dipoles()
+
+
 def pressed(scene):
     """Add two clamped rods, one lying on the other and both on a plane, without friction."""
     for i, height in enumerate((0.0105, 0.0315)):
@@ -40,6 +50,7 @@ def pressed(scene):
 
 
 SCENES |= {"dragged": dragged, "in_sand": in_sand, "joined_and_dragged": joined_and_dragged, "pressed": pressed}
+SCENES["magnetised"] = magnetised
 
 
 def gripped(scene):
@@ -94,6 +105,8 @@ def test_gradients_against_differences(device, name):
         "gravity": torch.zeros((model.worlds, 3), dtype=torch.float64, device=stiffness.device),
         "forces": torch.zeros_like(before.positions),
     }
+    if model.magnetic:
+        inputs["field"] = torch.zeros((model.worlds, 3), dtype=torch.float64, device=stiffness.device)
     if name == "gripped":
         inputs["poses"] = torch.zeros((model.worlds, 1, 6), dtype=torch.float64, device=stiffness.device)
     masses = [mass for mass in ("rod.mass", "shell.mass") if mass in before.engine.tables.names()]
@@ -119,6 +132,8 @@ def test_gradients_against_differences(device, name):
             "gravity": moved["gravity"] + torch.tensor(model.scene.gravity, dtype=torch.float64),
             "forces": moved["forces"],
         }
+        if "field" in moved:
+            controls["field"] = moved["field"] + 0.01
         if "poses" in moved:
             controls["poses"] = moved["poses"]
         after = simulator.step(state, parameters, controls)
