@@ -36,6 +36,9 @@ class ContactAdjoint:
     Sticking contacts creep, which is smooth. CCD step fractions are not differentiated. Rest lengths of edges, which define
     near-parallel pairs, and collision exclusion distances keep their values of the build.
 
+    Args:
+        on_obstacles: see `ExactContact`.
+
     Attributes:
         friction_iterations: number of friction updates in a step.
         by_groups: gradient by stiffness, range, thickness, friction and rate, of groups of first and second primitives (`NUMBERS`,
@@ -43,9 +46,9 @@ class ContactAdjoint:
         by_radius: gradient by radii (worlds, bodies), added to.
     """
 
-    def __init__(self, coupled):
+    def __init__(self, coupled, on_obstacles: bool = False):
         contact, real, device = coupled.host.contact_parameters, coupled.real, coupled.device
-        self.coupled, self.system = coupled, ExactContact(coupled)
+        self.coupled, self.system = coupled, ExactContact(coupled, on_obstacles)
         terms, search = self.system.terms, self.system.search
         serial, nodes = device_arrays.serial(device), len(terms.forces)
         every = wp.zeros(coupled.blocks, dtype=wp.uint8, device=device)

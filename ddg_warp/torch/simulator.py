@@ -183,8 +183,8 @@ class Simulator(torch.nn.Module):
         the meaning of wrenches. Worlds whose step was split into substeps have other ones.
 
         Raises:
-            SceneError: the scheme is the midpoint rule. The model has friction or follower loads on supports. A parameter is of
-                contact. A name or shape does not fit.
+            SceneError: the scheme is the midpoint rule. The model has several friction iterations, or follower loads on supports. A
+                parameter is of contact. A name or shape does not fit.
         """
         engine = self._own(after)
         if self._own(before) is not engine:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from ddg_warp.adjoint.contact import ContactAdjoint
 from ddg_warp.compile.support_dofs import NormalMoments, SupportDofs, matches
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.adjoint.element_forces import force_kernels
@@ -92,28 +93,28 @@ def _launch(term, index: int, inputs, outputs) -> None:
 
 
 class ContactForces(torch.autograd.Function):
-    """Function `forces(model, rate, q)` -> contact forces on dof blocks (worlds blocks, 3) at positions q.
+    """Function `forces(adjoint, dt, rates, q0, q)` -> forces of contact and friction on dof blocks, in a step from q0 to q.
 
-    `rate`: rate of the inertial stiffness (worlds,), empty for none; see `ContactModel.evaluate`.
+    `adjoint`: `ContactAdjoint`. `rates`: of the inertial stiffness at q and at q0 (worlds,), empty for none. Blocks are
+    (worlds blocks, 3).
     """
 
     @staticmethod
-    def forward(ctx, model, rate, q):
-        ctx.model, ctx.rate = model, rate
-        ctx.save_for_backward(q)
-        with torch_stream(q):
-            _evaluate_contact(model, rate, q)
-            return view(model.touch.terms.forces).clone()
+    def forward(ctx, adjoint, dt, rates, *blocks):
+        ctx.inputs = adjoint, dt, rates
+        ctx.save_for_backward(*blocks)
+        with torch_stream(blocks[0]):
+            _evaluate_contact(*ctx.inputs, *blocks)
+            return view(adjoint.system.terms.forces).clone()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, cotangent):
-        (q,), model = ctx.saved_tensors, ctx.model
-        with torch_stream(q):
-            x = _evaluate_contact(model, ctx.rate, q)
-            v, result = _blocks(cotangent), wp.zeros_like(x)
-            model.touch.terms.product(v, result, x)
-            return None, None, -view(result)
+        with torch_stream(cotangent):
+            (x0, x), rate = _evaluate_contact(*ctx.inputs, *ctx.saved_tensors)
+            by_start, by_end = wp.zeros_like(x0), wp.zeros_like(x)
+            ctx.inputs[0].vjp((x0, x0, x), _blocks(cotangent), rate, (by_start, by_start, by_end))
+            return None, None, None, view(by_start), view(by_end)
 
 
 def _blocks(values: torch.Tensor) -> wp.array:
@@ -122,11 +123,15 @@ def _blocks(values: torch.Tensor) -> wp.array:
     return wp.from_torch(values.detach().contiguous(), dtype=wp.types.vector(3, real), requires_grad=False)
 
 
-def _evaluate_contact(model, rate: torch.Tensor, q: torch.Tensor) -> wp.array:
-    """Evaluate contact at positions q, which are returned."""
-    x = _blocks(q)
-    model.touch.evaluate(x, wp.from_torch(rate.contiguous()) if len(rate) else None)
-    return x
+def _evaluate_contact(adjoint, dt: float, rates: tuple, q0: torch.Tensor, q: torch.Tensor) -> tuple:
+    """Evaluate contact at the end of a step from q0 to q; return both, and the inverse step (worlds,)."""
+    x0, x = _blocks(q0), _blocks(q)
+    rate = wp.full(adjoint.coupled.worlds, 1.0 / dt, dtype=adjoint.coupled.real, device=x.device)
+    rates = tuple(wp.from_torch(values.contiguous()) if len(values) else None for values in rates)
+    adjoint.system.find(x0, x0, x, rate, rates)
+    while adjoint.has_overflow(x):
+        adjoint.system.find(x0, x0, x, rate, rates)
+    return (x0, x), rate
 
 
 def without_gradient(engine) -> str:
@@ -136,7 +141,7 @@ def without_gradient(engine) -> str:
     fixed = [SupportDofs.of(part.host).place for part in parts]
     refused = {
         "the midpoint rule": engine.midpoint,
-        "friction": contact is not None and contact.has_friction,
+        "several friction iterations": bool(contact) and contact.has_friction and contact.law.friction_iterations > 1,
         "gyroscopic couples": engine.integrator.gyroscopic,
         "shell normals that a grip turns": model.coupled is not None
         and any(model.motions[i] in model.grips for part in model.coupled.sets for i in part.turning[:, 2]),
@@ -281,7 +286,7 @@ class _Part:
         if self._potential:
             for some, values in self._quadratic_forces(states, parameter_tensors, (time, dt)):
                 reaction = reaction.index_add(1, some, values)
-        contact = self._contact(after)
+        contact = self._contact(states, dt)
         if contact is not None:
             reaction = reaction - contact[self._index(self.dofs.place)]
         damping = self.model.scene.mass_damping
@@ -310,7 +315,7 @@ class _Part:
         """Yield the moments on prescribed shell normals."""
         yield from ()
 
-    def _contact(self, after: dict) -> torch.Tensor | None:
+    def _contact(self, states, dt: float) -> torch.Tensor | None:
         """Return contact forces on all dof blocks; None without contact."""
         return None
 
@@ -490,6 +495,7 @@ class _Coupled(_Part):
     def __init__(self, engine, number: int, coupled, dofs: SupportDofs):
         super().__init__(engine, number, coupled, dofs)
         host, scene = coupled.host, engine.model.scene
+        self._adjoint = ContactAdjoint(coupled, on_obstacles=True) if host.contact_parameters else None
         normals = NormalMoments.of(host, len(scene.supports), len(scene.shell_supports))
         self._listed, *items, columns = coupled_elements_at(host, dofs, normals)
         self._items, self._columns = tuple(map(self._long, items)), sum(map(len, self._listed))
@@ -531,12 +537,13 @@ class _Coupled(_Part):
         force, _ = QuadraticForces.apply(self._potential, step, *values)
         yield self._long(np.arange(len(self.dofs))), force[self._index(self.dofs.place)]
 
-    def _contact(self, after: dict) -> torch.Tensor | None:
+    def _contact(self, states, dt: float) -> torch.Tensor | None:
         """Return contact forces on all dof blocks; None without contact."""
-        if self.part.host.contact_parameters is None:
+        if self._adjoint is None:
             return None
-        q = after["net/q"]
-        return ContactForces.apply(self.model, after.get("net/rate", q.new_zeros(0)), q)
+        before, after = states
+        rates = [state.get("net/rate", state["net/q"].new_zeros(0)) for state in (after, before)]
+        return ContactForces.apply(self._adjoint, dt, rates, before["net/q"], after["net/q"])
 
     def _element_forces(self, states, parameter_tensors, controls: dict, dt: float) -> torch.Tensor:
         (before, after), coupled, worlds = states, self.part, len(self._worlds)

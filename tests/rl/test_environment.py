@@ -244,12 +244,12 @@ def test_wrenches_are_observed_and_differentiable():
     torch.testing.assert_close(fresh.wrenches.force[1:], after.wrenches.force[1:], rtol=0.0, atol=0.0)
 
 
-def test_wrenches_with_friction_are_constants():
+def test_wrenches_of_several_friction_iterations_are_constants():
     """Compare observed wrenches in friction with the integrator's; they have no gradient."""
     scene = a_scene()
     rod = scene.add_rod(POINTS + [0.0, 0.0, 0.0045], section=ddg.Circle(0.004), material=SOFT)
     scene.clamp(rod, motion=ddg.Grip(pivot=(0.1, 0.0, 0.0)))
-    scene.contact(friction=0.3)
+    scene.contact(friction=0.3, friction_iterations=2)
     scene.add_obstacle(ddg.Plane())
     env = environment(Simulator(built(scene), DT), wrenches=True)
     current = env.step(env.begin(env.generators(0)), (1e-3 * some_actions(1)[0]).requires_grad_())

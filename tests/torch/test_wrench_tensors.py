@@ -7,7 +7,7 @@ torch = pytest.importorskip("torch")
 
 import ddg_warp as ddg  # noqa: E402
 from ddg_warp.torch.simulator import Simulator  # noqa: E402
-from tests.test_wrenches import DT, SCENES, SECTION, line, pendulum, sheet  # noqa: E402
+from tests.test_wrenches import DT, SCENES, SECTION, line, pendulum, shake, sheet  # noqa: E402
 
 RUBBER = ddg.Material(young=2e6, poisson=0.35, density=1000.0, viscosity=1e-3)
 TIGHT = {"rtol": 1e-12, "max_iterations": 200}
@@ -49,8 +49,17 @@ def pressed(scene):
     scene.add_obstacle(ddg.Plane())
 
 
+def rubbed(scene):
+    """Add a clamped rod that slides on a plane, across another one, with friction."""
+    for i, height in enumerate((0.0105, 0.0315)):
+        points = line((0, 0.1 * i, height), (0.5, 0.05 - 0.05 * i, height))
+        scene.clamp_end(scene.add_rod(points, section=SECTION, material=RUBBER), motion=shake() if i else None)
+    scene.contact(friction=0.3, velocity=0.05, rolling=True)
+    scene.add_obstacle(ddg.Plane())
+
+
 SCENES |= {"dragged": dragged, "in_sand": in_sand, "joined_and_dragged": joined_and_dragged, "pressed": pressed}
-SCENES["magnetised"] = magnetised
+SCENES |= {"magnetised": magnetised, "rubbed": rubbed}
 
 
 def gripped(scene):

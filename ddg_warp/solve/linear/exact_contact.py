@@ -11,16 +11,19 @@ MARGIN = 1e-3  # of the search distance: skin margin; the query is a single posi
 class ExactContact:
     """Contact of a `CoupledModel`, with candidates found again at the friction lag and at the solution: steps keep none.
 
+    Args:
+        on_obstacles: True to compute forces on obstacles, too; their rows of H do not count.
+
     Attributes:
         `touch`: search, pairs and their terms, friction lag.
         hessian: `ContactHessian` at the solution.
     """
 
-    def __init__(self, coupled):
+    def __init__(self, coupled, on_obstacles: bool = False):
         self.coupled, contact = coupled, coupled.host.contact_parameters
-        obstacle_nodes = coupled.host.of_obstacles  # their rows of H do not count
+        silent = None if on_obstacles else coupled.host.of_obstacles
         self.touch = ContactModel(
-            coupled, wp.float64, coupled.rest().q, obstacle_nodes, MARGIN * contact.search_distance, exact=True
+            coupled, wp.float64, coupled.rest().q, silent, MARGIN * contact.search_distance, exact=True
         )
         self.search, self.terms = self.touch.search, self.touch.terms
         self.hessian = ContactHessian(self.terms, self.touch.shapes)
