@@ -56,7 +56,7 @@ class CoupledInputs:
         held: by the prescribed positions of fixed dofs at the solution (W N,).
         coefficients: by coefficients of edges (rows, W edges), by name of the force.
         rate, damping, gravity: by the quantities common to all blocks, one entry per block (W N,).
-        elements_rate: by the rate, of every set (W E,), and of friction.
+        elements_rate: by the rate, of every set (W E,), of forces on edges and of friction.
         contact_parameters, radius: by the parameters of contact, see `ContactAdjoint`; None without contact.
     """
 
@@ -174,6 +174,8 @@ class CoupledStepAdjoint:
                 wp.zeros(part.elements * coupled.worlds, dtype=real, device=self.device) for part in coupled.sets
             ],
         )
+        if self._quadratic:
+            self._inputs.elements_rate.append(self._quadratic.by_rate)
         if self.contact:
             self._inputs.contact_parameters, self._inputs.radius = self.contact.by_groups, self.contact.by_radius
             self._inputs.elements_rate.append(self.contact.grad_inverse_step)
@@ -287,7 +289,7 @@ class CoupledStepAdjoint:
             shares.collect(grad_q, carried, inputs.data)
             shares.add_own(own_rows)
             pull = ForceCotangents(
-                before, predictor and lagged.q, damped, w, rate, grad_q, start, inputs.rate, by_predicted
+                before, predictor and lagged.q, damped, w, self._rates, grad_q, start, None, by_predicted
             )
             for force in self.forces:
                 force.vjp(pull)

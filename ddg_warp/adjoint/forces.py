@@ -8,7 +8,6 @@ from scipy import sparse
 
 from ddg_warp import device_arrays
 from ddg_warp.kernels.adjoint import drag, follower_loads
-from ddg_warp.kernels.adjoint.coupled_assembly import gather_kernels
 from ddg_warp.kernels.core.inertia import block_inertia
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.forces.drag import ROWS
@@ -26,10 +25,10 @@ class ForceCotangents:
         predicted: nodes of the predictor [node][column]; None without `RodPredictor` or `CoupledPredictor`.
         solved: nodes of the solution, `x` and `theta`, or `q`.
         w: solution of the adjoint system, zero at fixed dofs.
-        rate: inverse step of implicit Euler.
+        rate: inverse step of implicit Euler, of every island.
         by_fixed: by fixed dofs.
         start: by the state before.
-        by_rate: by the rate.
+        by_rate: of a rod group, by the rate, in contributions of nodes.
         by_predicted: by the predictor, None without.
     """
 
@@ -37,10 +36,10 @@ class ForceCotangents:
     predicted: wp.array | None
     solved: object
     w: wp.array
-    rate: object
+    rate: wp.array
     by_fixed: wp.array
     start: object
-    by_rate: wp.array
+    by_rate: wp.array | None
     by_predicted: wp.array | None
 
 
@@ -107,92 +106,84 @@ class FollowerAdjoint:
         wp.launch(self._gather, (len(self._places), part.worlds), inputs, [by_x], device=part.device)
 
 
-class RodDragAdjoint:
-    """VJP of drag on a rod group.
+class DragAdjoint:
+    """VJP of drag on a rod group or on the coupled system.
 
     Attributes:
-        by_coefficients: gradient with respect to the coefficients of edges (rows of `kernels.forces.drag`, n, R), written by `vjp`.
+        by_coefficients: gradient by the coefficients of edges (rows of `kernels.forces.drag`, n, R), written by `vjp`; of the coupled
+            system (rows, W E), added to.
     """
 
     quadratic = True
 
-    def __init__(self, model, group, midpoint: bool):
-        kind, real, device = group.kind, model.types.real, model.wp_device
-        self.model, self.group, self.force = model, group, RodGroupDrag(model, group, midpoint)
-        self._edges, self._nodes = drag.rod_kernels(kind, real, midpoint)
-        shape = group.nodes, group.columns
-        self._by_edge, self._by_velocity, self.by_coefficients = (
-            device_arrays.allocate((rows, *shape), real, device) for rows in (kind.dim, kind.dim, ROWS)
+    def __init__(self, model, part, force, nodes, closed: bool, edges: int):
+        self.part, self.force, real = part, force, model.types.real
+        self._edges, self._gather = drag.pull_kernels(nodes, closed, real, force.midpoint)
+        self._shape, vector = (edges, part.columns), wp.types.vector(part.dim, real)
+        self._by_edge, self._by_velocity, self._by_nodes = (
+            device_arrays.allocate((*rows, *self._shape), vector, model.wp_device) for rows in ((), (), (2,))
         )
-        self._nowhere = device_arrays.allocate((1, 1, 1), real, device)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [self._edges, self._nodes, *self.force.kernels]
+        return [self._edges, self._gather, *self.force.kernels]
+
+    def _pull(self, lists: tuple, read: list, by_coefficients, by_rate, by_tangents, by_fixed, start) -> None:
+        """Launch the kernels; `lists` and arrays as of `kernels.adjoint.drag.pull_kernels`."""
+        (ends, angles, starts, items, fixed), part, slots = (
+            lists,
+            self.part,
+            [self._by_edge, self._by_velocity, self._by_nodes],
+        )
+        device = self.force.model.wp_device
+        inputs = [ends, angles, part.count, *read]
+        wp.launch(self._edges, self._shape, inputs, [*slots, by_coefficients, by_rate, start], device=device)
+        outputs = [by_tangents, by_fixed, start]
+        wp.launch(self._gather, start.x.shape, [starts, items, part.count, fixed, *slots], outputs, device=device)
+
+
+class RodDragAdjoint(DragAdjoint):
+    """VJP of drag on a rod group."""
+
+    def __init__(self, model, group, midpoint: bool):
+        force, kind = RodGroupDrag(model, group, midpoint), group.kind
+        super().__init__(model, group, force, kind.nodes, kind.closed, group.nodes)
+        self.by_coefficients = device_arrays.allocate((ROWS, *self._shape), model.types.real, model.wp_device)
 
     def vjp(self, pull: ForceCotangents) -> None:
         """Add the gradients of drag."""
-        group, before, start, predicted = self.group, pull.before, pull.start, self.force.midpoint
-        tangents, by_tangents = (pull.predicted, pull.by_predicted) if predicted else (before.x, self._nowhere)
-        read = [
-            tangents,
-            before.x,
-            before.v,
-            before.theta,
-            pull.solved.x,
-            pull.solved.theta,
-            self.force.coefficients,
-            self.force.flow,
-            pull.w,
-        ]
-        read += [group.count, pull.rate]
-        self._launch(self._edges, read, [self._by_edge, self._by_velocity, self.by_coefficients])
-        outputs = [by_tangents, pull.by_fixed, start.x, start.v, start.theta, pull.by_rate]
-        self._launch(self._nodes, [*read, group.fixed, self._by_edge, self._by_velocity], outputs)
-
-    def _launch(self, kernel, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, (self.group.nodes, self.group.columns), inputs, outputs, device=self.model.wp_device)
+        group, before, solved = self.part, pull.before, pull.solved
+        tangents = pull.predicted if self.force.midpoint else before.x
+        read = [tangents, group.node_state(before), solved.x, solved.theta, self.force.coefficients, self.force.flow]
+        outputs = [self.by_coefficients, pull.by_rate, pull.by_predicted, pull.by_fixed, group.node_state(pull.start)]
+        self._pull((None, None, None, None, group.fixed), [*read, pull.w, pull.rate], *outputs)
 
 
-class CoupledDragAdjoint:
-    """VJP of drag on the coupled system; further attributes as `RodDragAdjoint`.
+class CoupledDragAdjoint(DragAdjoint):
+    """VJP of drag on the coupled system.
 
     Attributes:
+        by_rate: gradient by the rate (W E,), added to.
         inertia: inertia and drag of the dof blocks in the current solve (worlds, N), written by `resist`.
     """
 
-    quadratic = True
-
     def __init__(self, model, coupled, midpoint: bool):
         real, device, (ends, angles) = model.types.real, coupled.device, coupled.host.forced_edges
-        self.coupled, self.force = coupled, CoupledDrag(model, midpoint)
-        self._gather, *_ = gather_kernels(real)
-        self._edges, self._nodes = drag.coupled_kernels(real, midpoint)
-        self._ends, self._angles = (
-            wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device) for values in (ends.T, angles)
+        super().__init__(model, coupled, CoupledDrag(model, midpoint), coupled.nodes, False, len(angles))
+        values = ends.T, angles, *lists(ends.ravel(), coupled.blocks)
+        self._lists = [wp.array(np.ascontiguousarray(v, np.int32), dtype=int, device=device) for v in values]
+        count = coupled.worlds * len(angles)
+        self.by_coefficients, self.by_rate = (
+            wp.zeros(shape, dtype=real, device=device) for shape in ((ROWS, count), count)
         )
-        self._starts, self._items = (
-            wp.array(values.astype(np.int32), dtype=int, device=device)
-            for values in lists(ends.ravel(), coupled.blocks)
-        )
-        self._edge_count, count = len(ends.T), len(ends.T) * coupled.worlds
-        self._by_tangent, self._by_velocity = (
-            wp.zeros((2, count), dtype=coupled.vector, device=device) for _ in range(2)
-        )
-        self.by_coefficients = wp.zeros((ROWS, count), dtype=real, device=device)
         self.inertia = wp.zeros((coupled.worlds, coupled.blocks), dtype=block_inertia(real), device=device)
         self._islands = Islands(coupled.worlds, real, device)
-
-    @property
-    def kernels(self) -> list:
-        """Kernels to load before a capture."""
-        return [self._edges, self._nodes, *self.force.kernels]
 
     def resist(self, before, tangents: wp.array, rate: float) -> None:
         """Write `inertia` of a solve from the state `before`, with the tangents of that solve."""
         self._islands.inverse_step.fill_(rate)
-        self.force.resist(before, tangents, self.inertia, self.coupled.still, self._islands)
+        self.force.resist(before, tangents, self.inertia, self.part.still, self._islands)
 
     @property
     def matrix(self) -> sparse.csc_matrix:
@@ -201,28 +192,20 @@ class CoupledDragAdjoint:
 
     def vjp(self, pull: ForceCotangents) -> None:
         """Add the gradients of drag."""
-        coupled, before, q, w, start = self.coupled, pull.before, pull.solved.q, pull.w, pull.start
-        tangents, by_tangents = (pull.predicted, pull.by_predicted) if self.force.midpoint else (before.q, start.q)
-        read = [
-            tangents,
-            before.q,
-            before.v,
-            q,
-            self._ends,
-            self._angles,
-            self.force.coefficients,
-            self.force.flow,
-            w,
-            pull.rate,
-        ]
-        outputs = [self._by_tangent, self._by_velocity, self.by_coefficients]
-        self._launch(self._edges, self.by_coefficients.shape[1], [*read, coupled.blocks], outputs)
-        for slots, target in ((self._by_tangent, by_tangents), (self._by_velocity, start.v)):
-            self._launch(
-                self._gather, len(q), [self._starts, self._items, self._edge_count, coupled.blocks, slots], [target]
-            )
-        inputs = [self.inertia, before.q, q, w, pull.rate, coupled.blocks]
-        self._launch(self._nodes, len(q), inputs, [pull.by_fixed, start.q, pull.by_rate])
+        coupled, before, worlds = self.part, pull.before, self.part.worlds
+        points, components = coupled.points, coupled.components
 
-    def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim, inputs, outputs, device=self.coupled.device)
+        def by_world(values: wp.array) -> wp.array:
+            """View values of edges (W E,) as [edge][world]."""
+            return values.reshape((worlds, -1)).transpose((1, 0))
+
+        def rows(values: wp.array) -> wp.array:
+            """View coefficients (rows, W E) as [row][edge][world]."""
+            return values.reshape((ROWS, worlds, -1)).transpose((0, 2, 1))
+
+        tangents = points(pull.predicted if self.force.midpoint else before.q)
+        read = [tangents, coupled.node_state(before), points(pull.solved.q), None, rows(self.force.coefficients)]
+        read += [self.force.flow, components(pull.w), pull.rate]
+        by_tangents = components(pull.by_predicted) if self.force.midpoint else None
+        outputs = [rows(self.by_coefficients), by_world(self.by_rate), by_tangents, components(pull.by_fixed)]
+        self._pull((*self._lists, None), read, *outputs, coupled.node_state(pull.start))

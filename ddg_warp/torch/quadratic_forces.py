@@ -69,7 +69,7 @@ class QuadraticPotential:
         else:
             moments = [by_moment[None]] if self._part.kind.twist else []
             w = wp.from_torch(-torch.cat([by_force.permute(2, 0, 1), *moments]))
-            rate = wp.full(self._part.columns, rate, dtype=self._real, device=w.device)
+        rate = wp.full(self._part.columns, rate, dtype=self._real, device=w.device)
         self._adjoint.by_coefficients.zero_()
         by_rate = wp.zeros(tuple(x0.shape[:-1]), dtype=self._real, device=w.device)
         read = before, None, self._state(x, v0, theta), w, rate
@@ -99,7 +99,8 @@ class QuadraticPotential:
     def _state(self, x: torch.Tensor, v: torch.Tensor, theta: torch.Tensor) -> SimpleNamespace:
         if self._is_coupled:
             return SimpleNamespace(q=self._array(x), v=self._array(v))
-        return SimpleNamespace(x=self._array(x), v=self._array(v), theta=wp.from_torch(theta.detach()))
+        angles = wp.from_torch(theta.detach())
+        return SimpleNamespace(x=self._array(x), v=self._array(v), theta=angles, omega=angles)
 
     def _array(self, values: torch.Tensor) -> wp.array:
         return wp.from_torch(values.detach(), dtype=self._vector, requires_grad=False)

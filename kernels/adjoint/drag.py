@@ -1,7 +1,7 @@
 """Vector-Jacobian product of drag, with resistance lagged at the start of a step or at the predicted midpoint.
 
 Gradients are of w . f, with the force f = -D (r (x - x_n) - u) on a node of resistance D, in a solve of length 1 / r; see
-`kernels.forces.drag`.
+`kernels.forces.drag`. They are evaluated by edges and gathered by nodes.
 """
 
 from functools import cache
@@ -9,16 +9,14 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.core.dof_map import row_functions
-from ddg_warp.kernels.core.inertia import block_inertia
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.elements.rod_layout import RodKind, gather_functions
+from ddg_warp.kernels.core.nodes import NodeStorage, state_type
 from ddg_warp.kernels.forces.drag import FIRST, LAST, ROTATIONAL, ROWS, edge_function
-from ddg_warp.kernels.residual.rod_residual import node_functions
 
 
 @cache
-def resisted_function(dim: int, real):
-    """Return the device function `resisted(e, v, p, wa, za, wb, zb, spin)`: w . f of the halves of an edge and of its twist angle.
+def work_function(dim: int, real):
+    """Return the device function `work(e, v, p, wa, za, wb, zb, spin)`: w . f of the halves of an edge and of its twist angle.
 
     Nodes move at za, zb; `spin` is the rate of the twist angle times its w.
     """
@@ -26,229 +24,172 @@ def resisted_function(dim: int, real):
     half = edge_function(dim, real)
 
     @wp.func
-    def resisted(e: V, v: V, p: P, wa: V, za: V, wb: V, zb: V, spin: real):
+    def work(e: V, v: V, p: P, wa: V, za: V, wb: V, zb: V, spin: real):
         D = half(e, v, p)
         bodies = p[wp.static(FIRST)] * wp.dot(wa, za) + p[wp.static(LAST)] * wp.dot(wb, zb)
         return -wp.dot(wa, D * za) - wp.dot(wb, D * zb) - bodies - spin * p[wp.static(ROTATIONAL)] * wp.length(e)
 
-    return resisted
+    return work
 
 
 @cache
-def rod_kernels(kind: RodKind, real, midpoint: bool):
-    """Build the kernels of uncoupled rods.
+def pull_kernels(nodes: NodeStorage, closed: bool, real, midpoint: bool):
+    """Build the kernels of the product.
 
-    `edges`: write gradients by edge vectors of `tangents`, by mean velocities of edges and by coefficients.
-    `nodes`: add gradients by the previous state, by fixed dofs and by the rate, through these and the resistance.
+    `edges`: write gradients by edge vectors of `tangents`, by velocities of edges before and of nodes in the solve, by coefficients.
+    Add gradients by the rate and by twist angles; of the coupled system by coefficients, too.
+    `gather`: add gradients by nodes; by tangents to `tangent_out` if these are predicted, else to the previous positions.
+
+    The coupled system has the nodes `ends` of every edge, and the dof block of its angle or -1. The items of a node are edges that
+    begin there, and edges that end there plus the number of edges.
     """
-    dim, twist, closed = kind.dim, kind.twist, kind.closed
-    V, M, P = wp.types.vector(dim, real), wp.types.matrix((dim, dim), real), wp.types.vector(ROWS, real)
-    half, resisted = edge_function(dim, real), resisted_function(dim, real)
-    previous, _ = node_functions(kind, real)
-    along, *_ = gather_functions(kind, real)
-    row, _ = row_functions(dim, real)
-
-    @wp.func
-    def law(coefficients: wp.array3d(dtype=real), k: int, r: int):
-        p = P()
-        for i in range(wp.static(ROWS)):
-            p[i] = coefficients[i, k, r]
-        return p
+    dim, twist, coupled = nodes.dim, nodes.twist, nodes.coupled
+    V, P, State = wp.types.vector(dim, real), wp.types.vector(ROWS, real), state_type(nodes, real)
+    work, (row, _) = work_function(dim, real), row_functions(dim, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def edges(
-        tangents: wp.array2d(dtype=V),
-        x0: wp.array2d(dtype=V),
-        v0: wp.array2d(dtype=V),
-        theta0: wp.array2d(dtype=real),
-        x: wp.array2d(dtype=V),
-        theta: wp.array2d(dtype=real),
-        coefficients: wp.array3d(dtype=real),
-        flow: wp.array(dtype=V),
-        w: wp.array3d(dtype=real),
-        count: wp.array(dtype=int),
-        rate: wp.array(dtype=real),
-        edge_out: wp.array3d(dtype=real),
-        velocity_out: wp.array3d(dtype=real),
-        coefficient_out: wp.array3d(dtype=real),
-    ):
-        k, r = wp.tid()
-        n = count[r]
-        if k >= n - wp.static(0 if closed else 1):
-            return
-        b = along(k + 1, n)
-        e = tangents[b, r] - tangents[k, r]
-        v = (v0[k, r] + v0[b, r]) * real(0.5) - flow[0]
-        za = (x[k, r] - x0[k, r]) * rate[r] - flow[0]
-        zb = (x[b, r] - x0[b, r]) * rate[r] - flow[0]
-        spin_work = real(0.0)
-        if wp.static(twist):
-            spin_work = w[wp.static(dim), k, r] * rate[r] * (theta[k, r] - theta0[k, r])
-        de, dv, dp, _wa, _za, _wb, _zb, _turn = wp.grad(resisted)(
-            e, v, law(coefficients, k, r), row(w, k, r), za, row(w, b, r), zb, spin_work
-        )
-        for d in range(wp.static(dim)):
-            edge_out[d, k, r] = de[d]
-            velocity_out[d, k, r] = dv[d]
-        for i in range(wp.static(ROWS)):
-            coefficient_out[i, k, r] = dp[i]
-
-    @wp.func
-    def of_edge(
-        x: wp.array2d(dtype=V),
-        v: wp.array2d(dtype=V),
-        coefficients: wp.array3d(dtype=real),
-        u: V,
-        k: int,
-        n: int,
-        r: int,
-    ):
-        b = along(k + 1, n)
-        return half(x[b, r] - x[k, r], (v[k, r] + v[b, r]) * real(0.5) - u, law(coefficients, k, r))
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def nodes(
-        tangents: wp.array2d(dtype=V),
-        x0: wp.array2d(dtype=V),
-        v0: wp.array2d(dtype=V),
-        theta0: wp.array2d(dtype=real),
-        x: wp.array2d(dtype=V),
-        theta: wp.array2d(dtype=real),
-        coefficients: wp.array3d(dtype=real),
-        flow: wp.array(dtype=V),
-        w: wp.array3d(dtype=real),
-        count: wp.array(dtype=int),
-        rate: wp.array(dtype=real),
-        fixed: wp.array2d(dtype=wp.uint8),
-        edge_in: wp.array3d(dtype=real),
-        velocity_in: wp.array3d(dtype=real),
-        tangent_out: wp.array3d(dtype=real),
-        fixed_out: wp.array3d(dtype=real),
-        x_out: wp.array2d(dtype=V),
-        v_out: wp.array2d(dtype=V),
-        theta_out: wp.array2d(dtype=real),
-        rate_out: wp.array2d(dtype=real),
-    ):
-        """Add gradients; by tangents to `tangent_out` if these are predicted, else to the previous positions."""
-        k, r = wp.tid()
-        n = count[r]
-        if k >= n:
-            return
-        D = M()
-        one = wp.identity(n=wp.static(dim), dtype=real)
-        by_tangent = V()
-        by_velocity = V()
-        b = previous(k, n)
-        if wp.static(closed) or k < n - 1:
-            D += of_edge(tangents, v0, coefficients, flow[0], k, n, r) + one * coefficients[wp.static(FIRST), k, r]
-            by_tangent -= row(edge_in, k, r)
-            by_velocity += row(velocity_in, k, r)
-        if b >= 0:
-            D += of_edge(tangents, v0, coefficients, flow[0], b, n, r) + one * coefficients[wp.static(LAST), b, r]
-            by_tangent += row(edge_in, b, r)
-            by_velocity += row(velocity_in, b, r)
-        back = D * row(w, k, r)
-        mask = int(fixed[k, r])
-        by_start = back * rate[r]
-        for d in range(wp.static(dim)):
-            if ((mask >> d) & 1) == 1:
-                fixed_out[d, k, r] = fixed_out[d, k, r] - by_start[d]
-        grad_inverse_step = -wp.dot(back, x[k, r] - x0[k, r])
-        if wp.static(midpoint):
-            for d in range(wp.static(dim)):
-                tangent_out[d, k, r] = tangent_out[d, k, r] + by_tangent[d]
-        else:
-            by_start += by_tangent
-        x_out[k, r] = x_out[k, r] + by_start
-        v_out[k, r] = v_out[k, r] + by_velocity * real(0.5)
-        if wp.static(twist):
-            if wp.static(closed) or k < n - 1:
-                e = tangents[along(k + 1, n), r] - tangents[k, r]
-                spin = w[wp.static(dim), k, r] * coefficients[wp.static(ROTATIONAL), k, r] * wp.length(e)
-                theta_out[k, r] = theta_out[k, r] + spin * rate[r]
-                grad_inverse_step -= spin * (theta[k, r] - theta0[k, r])
-        rate_out[k, r] = rate_out[k, r] + grad_inverse_step
-
-    return edges, nodes
-
-
-@cache
-def coupled_kernels(real, midpoint: bool):
-    """Build the kernels of the coupled system.
-
-    `edges`: write gradients by both nodes of an edge, and add gradients by coefficients.
-    `nodes`: add gradients through the resistance by the previous state, by fixed dofs and by the rate.
-    """
-    V, P = wp.types.vector(3, real), wp.types.vector(ROWS, real)
-    Inertia, resisted = block_inertia(real), resisted_function(3, real)
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def edges(
-        tangents: wp.array(dtype=V),
-        q0: wp.array(dtype=V),
-        v0: wp.array(dtype=V),
-        q: wp.array(dtype=V),
         ends: wp.array2d(dtype=int),
         angles: wp.array(dtype=int),
-        coefficients: wp.array2d(dtype=real),
+        count: wp.array(dtype=int),
+        tangents: wp.array2d(dtype=V),
+        before: State,
+        x: wp.array2d(dtype=V),
+        theta: wp.array2d(dtype=real),
+        coefficients: wp.array3d(dtype=real),
         flow: wp.array(dtype=V),
-        w: wp.array(dtype=V),
-        rate: real,
-        blocks: int,
-        tangent_out: wp.array2d(dtype=V),
+        w: wp.array3d(dtype=real),
+        rate: wp.array(dtype=real),
+        edge_out: wp.array2d(dtype=V),
         velocity_out: wp.array2d(dtype=V),
-        coefficient_out: wp.array2d(dtype=real),
+        node_out: wp.array3d(dtype=V),
+        coefficient_out: wp.array3d(dtype=real),
+        rate_out: wp.array2d(dtype=real),
+        start_out: State,
     ):
-        """Write gradients of edges; `angles` are dof blocks of their twist angles, -1 for none."""
-        tid = wp.tid()
-        world = tid / ends.shape[0]
-        edge = tid - world * ends.shape[0]
-        a = ends[edge, 0] + world * blocks
-        b = ends[edge, 1] + world * blocks
+        edge, island = wp.tid()
+        a = edge
+        b = edge + 1
+        angle = int(-1)
+        if wp.static(coupled):
+            a = ends[edge, 0]
+            b = ends[edge, 1]
+            angle = angles[edge]
+        else:
+            n = count[island]
+            if edge >= n - wp.static(0 if closed else 1):
+                return
+            if b == n:
+                b = 0
+        r = rate[island]
         p = P()
         for i in range(wp.static(ROWS)):
-            p[i] = coefficients[i, tid]
-        u = flow[0]
-        spin = real(0.0)
-        if angles[edge] >= 0:
-            angle = angles[edge] + world * blocks
-            spin = w[angle][0] * rate * (q[angle][0] - q0[angle][0])
-        de, dv, dp, _wa, _za, _wb, _zb, _turn = wp.grad(resisted)(
-            tangents[b] - tangents[a],
-            (v0[a] + v0[b]) * real(0.5) - u,
+            p[i] = coefficients[i, edge, island]
+        moved_a = x[a, island] - before.x[a, island]
+        moved_b = x[b, island] - before.x[b, island]
+        rotated = real(0.0)
+        w_angle = real(0.0)
+        if wp.static(twist):
+            rotated = theta[edge, island] - before.theta[edge, island]
+            w_angle = w[wp.static(dim), edge, island]
+        if angle >= 0:
+            rotated = x[angle, island][0] - before.x[angle, island][0]
+            w_angle = w[0, angle, island]
+        de, dv, dp, _wa, za, _wb, zb, spin = wp.grad(work)(
+            tangents[b, island] - tangents[a, island],
+            (before.v[a, island] + before.v[b, island]) * real(0.5) - flow[0],
             p,
-            w[a],
-            (q[a] - q0[a]) * rate - u,
-            w[b],
-            (q[b] - q0[b]) * rate - u,
-            spin,
+            row(w, a, island),
+            moved_a * r - flow[0],
+            row(w, b, island),
+            moved_b * r - flow[0],
+            w_angle * r * rotated,
         )
-        tangent_out[0, tid] = -de
-        tangent_out[1, tid] = de
-        for i in range(2):
-            velocity_out[i, tid] = dv * real(0.5)
+        edge_out[edge, island] = de
+        velocity_out[edge, island] = dv * real(0.5)
+        node_out[0, edge, island] = za * r
+        node_out[1, edge, island] = zb * r
+        by_rate = wp.dot(za, moved_a) + wp.dot(zb, moved_b) + spin * w_angle * rotated
+        rate_out[edge, island] = rate_out[edge, island] + by_rate
         for i in range(wp.static(ROWS)):
-            coefficient_out[i, tid] = coefficient_out[i, tid] + dp[i]
+            if wp.static(coupled):
+                dp[i] = dp[i] + coefficient_out[i, edge, island]
+            coefficient_out[i, edge, island] = dp[i]
+        if wp.static(twist):
+            start_out.theta[edge, island] = start_out.theta[edge, island] - spin * w_angle * r
+        if angle >= 0:
+            by_angle = V()
+            by_angle[0] = spin * w_angle * r
+            start_out.x[angle, island] = start_out.x[angle, island] - by_angle
+
+    @wp.func
+    def add(
+        edge_in: wp.array2d(dtype=V),
+        velocity_in: wp.array2d(dtype=V),
+        node_in: wp.array3d(dtype=V),
+        side: int,
+        edge: int,
+        island: int,
+        by_tangent: V,
+        by_velocity: V,
+        by_node: V,
+    ):
+        sign = real(2 * side - 1)
+        by_tangent += edge_in[edge, island] * sign
+        by_velocity += velocity_in[edge, island]
+        by_node += node_in[side, edge, island]
+        return by_tangent, by_velocity, by_node
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def nodes(
-        inertia: wp.array2d(dtype=Inertia),
-        q0: wp.array(dtype=V),
-        q: wp.array(dtype=V),
-        w: wp.array(dtype=V),
-        rate: real,
-        blocks: int,
-        fixed_out: wp.array(dtype=V),
-        q_out: wp.array(dtype=V),
-        rate_out: wp.array(dtype=real),
+    def gather(
+        starts: wp.array(dtype=int),
+        items: wp.array(dtype=int),
+        count: wp.array(dtype=int),
+        fixed: wp.array2d(dtype=wp.uint8),
+        edge_in: wp.array2d(dtype=V),
+        velocity_in: wp.array2d(dtype=V),
+        node_in: wp.array3d(dtype=V),
+        tangent_out: wp.array3d(dtype=real),
+        fixed_out: wp.array3d(dtype=real),
+        start_out: State,
     ):
-        """Add gradients through the resistance, which `inertia` contains."""
-        i = wp.tid()
-        world = i / blocks
-        node = inertia[world, i - world * blocks]
-        back = node.stiffness * w[i]
-        fixed_out[i] = fixed_out[i] - back
-        q_out[i] = q_out[i] + back
-        rate_out[i] = rate_out[i] - wp.dot(back, q[i] - q0[i]) / rate
+        k, island = wp.tid()
+        by_tangent = V()
+        by_velocity = V()
+        by_node = V()
+        mask = int(255)
+        if wp.static(coupled):
+            for index in range(starts[k], starts[k + 1]):
+                side = items[index] / edge_in.shape[0]
+                edge = items[index] - side * edge_in.shape[0]
+                by_tangent, by_velocity, by_node = add(
+                    edge_in, velocity_in, node_in, side, edge, island, by_tangent, by_velocity, by_node
+                )
+        else:
+            n = count[island]
+            if k >= n:
+                return
+            mask = int(fixed[k, island])
+            if wp.static(closed) or k < n - 1:
+                by_tangent, by_velocity, by_node = add(
+                    edge_in, velocity_in, node_in, 0, k, island, by_tangent, by_velocity, by_node
+                )
+            b = k - 1
+            if wp.static(closed):
+                if k == 0:
+                    b = n - 1
+            if b >= 0:
+                by_tangent, by_velocity, by_node = add(
+                    edge_in, velocity_in, node_in, 1, b, island, by_tangent, by_velocity, by_node
+                )
+        for d in range(wp.static(dim)):
+            if ((mask >> d) & 1) == 1:
+                fixed_out[d, k, island] = fixed_out[d, k, island] + by_node[d]
+            if wp.static(midpoint):
+                tangent_out[d, k, island] = tangent_out[d, k, island] + by_tangent[d]
+        if wp.static(not midpoint):
+            by_node -= by_tangent
+        start_out.x[k, island] = start_out.x[k, island] - by_node
+        start_out.v[k, island] = start_out.v[k, island] + by_velocity
 
-    return edges, nodes
+    return edges, gather
