@@ -3,7 +3,7 @@
     "rod.mass"       [kg] of the points of all rods, including point masses of `Scene.add_mass`
     "rod.inertia"    [kg m^2] about the tangent, of the edges of rods with twist
     "shell.mass"     [kg] of the vertices of all shells, "meridian.mass" of the nodes of all shells of revolution
-    "FORCE.NAME"     of the edges of rods with a force, see its class in `solve.forces`
+    "FORCE.NAME"     of the edges of rods with a force of `solve.forces.force_list.WITH_PARAMETERS`, whose class describes them
     "contact.stiffness" [N/m], "contact.range" [m], no larger than the largest of the scene, "contact.friction"
                      between objects of two names, or of one, that may come into contact. Friction exists in scenes with friction;
                      if anisotropic it is the smallest nonzero coefficient, to which the others keep their ratios
