@@ -15,6 +15,7 @@ from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.newton.rod_iterate import UPDATE_FRAMES
 from ddg_warp.model.parameters import ParameterTable
 from ddg_warp.model.rod_elements import RodElements
+from ddg_warp.model.user_forces import UserForceArrays
 
 
 @dataclass
@@ -130,18 +131,21 @@ class CoupledModel:
 
     Args:
         motions: index of the motion that rotates each support of shells and rings, -1 for none.
+        user_forces: `UserForce` of the scene.
 
     Attributes:
         mass: of dof blocks (worlds, N) [kg, kg m^2].
         has_custom_mass: True if `mass` may differ from `host`.
         moves: masses of dof blocks (N,), positive where inertia or a quadratic potential determine a rate.
         coefficients: coefficients of forces on edges by name, world by world (rows, W E); see `CoupledSystem.forced_edges`.
+        user_forces: `UserForceArrays` of the user-defined forces.
         contact_parameters: contact parameters by name: "stiffness", "range" and "friction" (worlds, groups, groups), "radius"
             (worlds, bodies).
     """
 
-    def __init__(self, host: CoupledSystem, worlds: int, device, real, motions: np.ndarray):
+    def __init__(self, host: CoupledSystem, worlds: int, device, real, motions: np.ndarray, user_forces: list):
         self.host, self.worlds, self.device, self.real = host, worlds, device, real
+        self.user_forces = [UserForceArrays(force, host, worlds, device, real) for force in user_forces]
         self.vector = wp.types.vector(3, real)
         self.blocks, self.angle_start = host.blocks, host.nodes
         self.dim, self.world_columns, self.columns = 3, 1, worlds
@@ -174,6 +178,10 @@ class CoupledModel:
         self.world = wp.array(np.arange(worlds), dtype=int, device=device)
         self.still = wp.zeros(worlds, dtype=real, device=device)
         self.every = wp.full(worlds, 1, dtype=int, device=device)
+
+    def has_quadratic_matrix(self, quadratic: bool) -> bool:
+        """Return True if matrices take blocks with a stiffness: `quadratic` potentials or user-defined forces."""
+        return quadratic or bool(self.user_forces)
 
     def _zeros(self, rows: int, columns: int) -> wp.array:
         return wp.zeros((max(1, rows), max(1, columns)), dtype=self.real, device=self.device)

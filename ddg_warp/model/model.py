@@ -82,7 +82,8 @@ class Model:
         place = {id(motion): i for i, motion in enumerate(self.motions)}
         motions = [place[id(s.motion)] if turns else -1 for s, turns in zip(supports, turning, strict=True)]
         coupled = compile_coupled(self.scene, along=self.wp_device.is_cpu)
-        return CoupledModel(coupled, self.worlds, self.wp_device, self.types.real, np.array(motions, int))
+        motions, user_forces = np.array(motions, int), self.scene.user_forces
+        return CoupledModel(coupled, self.worlds, self.wp_device, self.types.real, motions, user_forces)
 
     def __repr__(self) -> str:
         scene, coupled = self.scene, self.coupled
@@ -228,6 +229,10 @@ class Model:
             ValueError: nothing has the term, the term has no such parameter, a field prescribes it, or the shape or a value is wrong;
                 nothing is changed.
         """
+        if (force := self._user_force(term)) is not None:
+            force.set(parameter, values)
+            self.note_change(False)
+            return
         parts = self.coupled.sets if self.coupled is not None else ()
         values, remade = self.valid_values(term, parameter, values), False
         self.fields.refuse("set_parameter", f"{term}.{parameter}")
@@ -241,6 +246,11 @@ class Model:
             if part.term.name == term and parameter in part.parameters.values:
                 remade |= part.set_parameter(parameter, values)
         self.note_change(remade)
+
+    def _user_force(self, name: str):
+        """Return the user-defined force of a name; None without."""
+        forces = self.coupled.user_forces if self.coupled is not None else ()
+        return next((force for force in forces if force.name == name), None)
 
     def note_change(self, remade: bool) -> None:
         """Count a change of parameters or rest shapes in `version`, and a reallocation in `layout`.
@@ -322,6 +332,8 @@ class Model:
             for number, part in enumerate(parts):  # one element set for each law
                 place = f"net/{term}" + (f" {number}" if number else "")
                 result |= {f"{place}/{name}": values for name, values in part.parameters.values.items()}
+        for force in self.coupled.user_forces if self.coupled is not None else ():
+            result |= {f"net/{force.name}/{name}": values for name, values in force.values.items()}
         return result
 
     def state(self, points=None, velocities=None, spins=None, angles=None) -> State:
@@ -495,6 +507,7 @@ def needs_coupling(scene) -> bool:
         scene.magnets,
         scene.axisymmetric_shells,
         scene.contact_settings,
+        scene.user_forces,
     )
     return any(map(bool, parts))
 

@@ -18,11 +18,12 @@ from ddg_warp.scene.law import Law, laws_of
 from ddg_warp.scene.material import Material, Stiffness, stiffness_of
 from ddg_warp.scene.prescribed_motion import Motion
 from ddg_warp.scene.shells_and_joints import Structures
+from ddg_warp.scene.user_force import UserForces
 
 
 @argument_checks.called
 @dataclass(kw_only=True, repr=False, eq=False)
-class Scene(Structures, Fields):
+class Scene(Structures, Fields, UserForces):
     """Description of rods and shells with supports and loads, from which `build` compiles a model.
 
     A model is independent of later changes of the scene.

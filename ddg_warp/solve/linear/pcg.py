@@ -43,6 +43,7 @@ class PCG:
         scale: power of two by which residuals and directions are scaled, against underflow and overflow of products; see
             `natural_scale`.
         indefinite: True if H may be indefinite.
+        user_forces: `UserForces` to add to H, or None.
 
     Attributes:
         `rest`, `z`: scaled residual, preconditioned residual.
@@ -62,9 +63,11 @@ class PCG:
         multilevel: bool,
         indefinite: bool = False,
         scale: float = 1.0,
+        user_forces=None,
     ):
         self._scale, self._unit = linear(scale), linear(1.0 / scale)
         self.coupled, self.sparsity, self.substructuring, self.contact = coupled, sparsity, substructuring, contact
+        self._pair_forces = user_forces if user_forces and user_forces.pairs else None
         worlds, count, device = coupled.worlds, coupled.worlds * coupled.blocks, coupled.device
         H, M = wp.types.vector(3, linear), wp.types.matrix((3, 3), linear)
         self.rest, self.z, self.p, self.product = (wp.zeros(count, dtype=H, device=device) for _ in range(4))
@@ -162,16 +165,18 @@ class PCG:
 
     @timer("product")
     def multiply(self, system, p: wp.array) -> None:
-        """Write H p on active dofs, and p . H p block by block; no matrix has the contact terms."""
+        """Write H p on active dofs, and p . H p block by block; no matrix has contact and pair forces."""
         if self.substructuring and self.substructuring.banded:  # elements along rods are stored in bands
             elements = partial(self.substructuring.bands.product, system, p, self.product)
         else:
             elements = partial(self.multiply_matrix, system, p)
-        if not self.contact:
+        if self.contact:
+            device_arrays.side_by_side([elements, partial(self.contact.spread, p)], self.coupled.device)
+            self.contact.settle(p, self.product, system)
+        else:
             elements()
-            return
-        device_arrays.side_by_side([elements, partial(self.contact.spread, p)], self.coupled.device)
-        self.contact.settle(p, self.product, system)
+        if self._pair_forces:
+            self._pair_forces.multiply(p, self.product, system)
 
     def multiply_matrix(self, system, p: wp.array) -> None:
         """Write the product without contact, with all of H in the sparse matrix."""
@@ -206,9 +211,11 @@ class NewtonPCG(PCG):
         rtol: float,
         relaxed,
         keeps_levels: bool,
+        user_forces=None,
     ):
         self.scale, real = natural_scale(coupled), coupled.real
-        super().__init__(coupled, sparsity, substructuring, contact, linear, multilevel, scale=self.scale)
+        parts = coupled, sparsity, substructuring, contact, linear, multilevel
+        super().__init__(*parts, scale=self.scale, user_forces=user_forces)
         self._tolerances, self._rtol, self._relaxed = tolerances, rtol, relaxed
         self._keeps_levels = keeps_levels
         self._largest = Sums(coupled.worlds, tolerances.ratio.shape[1], real, coupled.device, largest=True)

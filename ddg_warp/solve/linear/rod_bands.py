@@ -31,6 +31,7 @@ class RodBands:
     ):
         self.coupled, self.paths, self.sparsity, real = coupled, paths, sparsity, coupled.real
         device, contact, size = coupled.device, coupled.host.contact_parameters is not None, 3 * plan.block**2
+        outer, stiffened = contact or bool(coupled.user_forces), coupled.has_quadratic_matrix(quadratic)
         self.blocks = paths.allocate(size, linear) if factors is None else factors
         self.eliminated = paths.allocate(size, linear) if contact and banded else self.blocks
         along = [i for i, part in enumerate(coupled.sets) if part.host.along and banded]
@@ -41,7 +42,7 @@ class RodBands:
         self.sets = wp.array(self._of_sets, dtype=along_struct, device=device)
         serial = device_arrays.serial(device)
         self._assemble, self._clear, self._product = rod_bands.band_kernels(
-            self.terms, plan.twist, plan.span, real, linear, self.exact_from, quadratic, serial, plan.mixed_axial
+            self.terms, plan.twist, plan.span, real, linear, self.exact_from, stiffened, serial, plan.mixed_axial
         )
         if serial:
             self._product = rod_bands.product_walk_kernel(plan.twist, plan.span, linear, plan.mixed_axial)
@@ -53,7 +54,7 @@ class RodBands:
         outside[self.elsewhere] = 1
         self._apart = wp.array(outside, dtype=wp.uint8, device=device)
         self._balance = (
-            path_node_kernel(self.terms, plan.twist, real, linear, quadratic, contact, serial) if banded else None
+            path_node_kernel(self.terms, plan.twist, real, linear, quadratic, outer, serial) if banded else None
         )
         self._multiplies = banded and not exact
         self.longer = self._lengthen = None

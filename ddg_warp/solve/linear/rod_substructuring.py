@@ -72,7 +72,8 @@ class RodSubstructuring:
         """
         coupled, plan = self.coupled, self.plan
         plan.bind(coupled.host, sparsity.rows.numpy(), sparsity.columns.numpy(), self.kept)
-        self.exact = self.banded and plan.complete and not self._contact
+        pairs = any(part.force.pairs for part in coupled.user_forces)  # their blocks are in no matrix
+        self.exact = self.banded and plan.complete and not (self._contact or pairs)
         self.paths = paths = RodPaths(coupled, plan, sparsity)
         serial = device_arrays.serial(self.device)
         made = path_kernels(plan.twist, plan.span, linear, plan.size, serial, self.mixed_axial)
@@ -89,7 +90,8 @@ class RodSubstructuring:
         self._walk = None
         if self.exact and serial and not (reduces or reuse or self.mixed_axial):
             of_terms = self.bands.terms, plan.twist, plan.span, coupled.real, linear, self.bands.exact_from
-            self._walk = walk_kernel(*of_terms, quadratic, self._joints.count > 0)
+            stiffened = coupled.has_quadratic_matrix(quadratic)
+            self._walk = walk_kernel(*of_terms, stiffened, self._joints.count > 0)
 
     @property
     def kernels(self) -> list:

@@ -166,7 +166,8 @@ class MatrixAssembly:
                 each[first : first + sliced_ell.SETS] for each in (coupled.sets, exact_from, local)
             )
             terms = tuple(part.term for part in sets)
-            layout = from_iteration, local_dofs, quadratic, table.has_angles, serial
+            stiffened = coupled.has_quadratic_matrix(quadratic)
+            layout = from_iteration, local_dofs, stiffened, table.has_angles, serial
             self.kernels.append(sliced_ell.assemble_kernel(terms, coupled.real, linear, first == 0, *layout))
             set_data = []
             for i in range(first, first + len(sets)):

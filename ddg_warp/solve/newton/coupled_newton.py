@@ -13,6 +13,7 @@ from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.newton import coupled_newton
+from ddg_warp.solve.forces.user_force import UserForces
 from ddg_warp.solve.linear.linear_system import LinearSystem
 from ddg_warp.solve.linear.pcg import NewtonPCG, natural_scale
 from ddg_warp.solve.linear.rod_substructuring import RodSubstructuring
@@ -85,6 +86,10 @@ class CoupledNewton:
             raise SceneError(
                 "contact: solver 'projective' keeps the matrix of a step, which contact changes; use 'newton'"
             )
+        if coupled.user_forces and reuse:
+            raise SceneError(
+                "user-defined forces: solver 'projective' keeps the matrix of a step, which they change; use 'newton'"
+            )
         self.islands = Islands(coupled.worlds, real, coupled.device)
         self.frozen = FrozenHessian(self.islands) if reuse else None
         self.psd = self.automatic_psd() if options.psd == "auto" else options.psd
@@ -108,11 +113,17 @@ class CoupledNewton:
             self.contact = NewtonContact(model, self.iterates, self.islands.inverse_step, self.linear, self.psd)
             if self.substructuring:
                 self.contact.hessian.bind(self.substructuring)
+        self.user_forces, terms = None, self.contact and self.contact.terms
+        outer = (terms.forces, terms.blocks.stiffness) if terms else None
+        if coupled.user_forces:
+            self.user_forces = UserForces(model, self.linear, quadratic, terms)
+            outer = self.user_forces.total, self.user_forces.bound
         self.exact = self.substructuring is not None and self.substructuring.exact
         fails = self.psd == "none"
         curved = any(first is not None for first in self.elements.exact_from) or bool(
             self.contact and self.contact.bends
         )
+        curved = curved or self.user_forces is not None
         repeats = not reuse and (fails or curved or self.exact)
         self._repeat = coupled_newton.repeat_kernel(real, fails, curved) if repeats else None
         # flags of indefiniteness: repeat the iterate, or drop compression in the next one
@@ -132,7 +143,7 @@ class CoupledNewton:
             self.substructuring,
             self.planes,
             self.tolerances,
-            self.contact and self.contact.terms,
+            outer,
             self.linear,
             options.rtol,
             options.floor_factor * self._eps,
@@ -152,8 +163,9 @@ class CoupledNewton:
         if not self.exact:
             parts = self.sparsity, self.substructuring, self.contact and self.contact.hessian
             multilevel = preconditioner in ("multilevel", "substructuring_multilevel")
-            stop = self.tolerances, options.rtol, self.relaxed, self.keeps_levels and not self.contact
-            self.krylov = NewtonPCG(coupled, *parts, self.linear, multilevel, *stop)
+            keeps_levels = self.keeps_levels and not (self.contact or self.user_forces)
+            stop = self.tolerances, options.rtol, self.relaxed, keeps_levels
+            self.krylov = NewtonPCG(coupled, *parts, self.linear, multilevel, *stop, self.user_forces)
 
     def _require_exact(self) -> None:
         """Refuse the exact Hessian for measures without second derivatives."""
@@ -169,7 +181,7 @@ class CoupledNewton:
 
         Bodies in contact rotate and bend: without second derivatives the last digits take tens of iterations.
         """
-        if self.coupled.host.contact_parameters:
+        if self.coupled.host.contact_parameters or self.coupled.user_forces:
             return "progressive"
         bending = [part for part in self.coupled.sets if part.term.measure.packed and not self.frozen]
         changing = [part.parameters.foreign | part.parameters.prescribed for part in bending]
@@ -213,9 +225,15 @@ class CoupledNewton:
             self.edge_rotations,
             self.contact,
             self.sleeping,
+            self.user_forces,
         )
         kernels = [kernel for part in (*parts, self.relaxed) if part for kernel in part.kernels]
         return [*kernels, *self.coupled.carries, *([self._repeat] if self._repeat else [])]
+
+    @property
+    def inertia(self) -> wp.array:
+        """Inertia of blocks (worlds, N) in matrices, with the stiffness of forces on single nodes."""
+        return self.user_forces.inertia if self.user_forces else self.loading.mass
 
     @property
     def pcg_work(self) -> wp.array:
@@ -273,7 +291,11 @@ class CoupledNewton:
     def balance(self) -> None:
         """Compute residuals, the change of the energy, and the worlds that are out of equilibrium."""
         system, islands = self.system, self.islands
+        if self.user_forces:
+            self.user_forces.evaluate(self.iterates.proposed, islands)
         self.residual(self.iterates, self.loading, self.norms, system, islands)
+        if self.user_forces:
+            self.user_forces.account(self.iterates, self.norms, islands)
         flags = islands.not_converged, islands.below_rounding_floor
         self.tolerances.sum_up(system.rhs, self.options.rtol, islands, *flags, self.exact and not self.frozen)
 
@@ -296,6 +318,8 @@ class CoupledNewton:
         """Assemble H of the worlds that need a direction."""
         if self.frozen:
             self.frozen.update(self.islands)
+        if self.user_forces:
+            self.user_forces.assemble(self.iterates.proposed, self.loading.mass, self.islands)
         if not self.contact:
             self._assemble_elements()
             return
@@ -304,7 +328,7 @@ class CoupledNewton:
         self.contact.hessian.add_to_bands(self.islands.arrays[0])
 
     def _assemble_elements(self) -> None:
-        matrix, mass, updated_islands = self.system.matrix, self.loading.mass, self.updated_islands
+        matrix, mass, updated_islands = self.system.matrix, self.inertia, self.updated_islands
         self._assembly(mass, updated_islands, matrix)
         if self.planes:
             self.planes.matrix(matrix, updated_islands.needs_direction)
@@ -318,7 +342,7 @@ class CoupledNewton:
         if self.exact:
             system.indefinite.zero_()
             system.forcing.zero_()  # only rounding is left
-            self.substructuring.direct(system, self.loading.mass, islands, self.updated_islands)
+            self.substructuring.direct(system, self.inertia, islands, self.updated_islands)
         else:
             if self.contact:
                 self.contact.pending.approach(self.iterates, system, self.contact.terms)

@@ -14,7 +14,8 @@ class ResidualAssembler:
 
     Args:
         elements: `ElementEvaluation`, whose outputs are assembled; sparsity: `SparseSystem`, with the incidence lists.
-        `substructuring`, `planes`, `contact`: `RodSubstructuring`, `SkewSupports` and `ContactPotential`, or None.
+        `substructuring`, `planes`: `RodSubstructuring` and `SkewSupports`, or None.
+        outer: forces of contact and user-defined ones on blocks (W N,), and bounds of their stiffness; None without.
         tolerances: `ResidualTolerances`, whose ratios of blocks and rounding floors are written.
         rtol: relative tolerance; floor: rounding floor over the rounding bound.
         quadratic: True if blocks have a quadratic potential; see `kernels.core.inertia`.
@@ -31,7 +32,7 @@ class ResidualAssembler:
         substructuring,
         planes,
         tolerances,
-        contact,
+        outer,
         linear,
         rtol: float,
         rounding_factor: float,
@@ -49,8 +50,8 @@ class ResidualAssembler:
             rounding_factor,
         )
         inputs.allowed, outputs.least, outputs.ratio = tolerances.blocks, tolerances.least, tolerances.ratio
-        if contact:
-            inputs.push, inputs.pressed = contact.forces, contact.blocks.stiffness
+        if outer:
+            inputs.push, inputs.pressed = outer
         # an array of structures keeps no member alive
         self._meetings = list(_contributions(coupled, elements, sparsity, linear))
         self._sets = wp.array(self._meetings, dtype=coupled_residual.meeting_type(real, linear), device=coupled.device)
@@ -64,7 +65,7 @@ class ResidualAssembler:
             else [wp.zeros(0, dtype=dtype, device=coupled.device) for dtype in types]
         )
         serial = device_arrays.serial(coupled.device)
-        self.kernels = [coupled_residual.balance_kernel(real, linear, quadratic, contact is not None, serial)]
+        self.kernels = [coupled_residual.balance_kernel(real, linear, quadratic, outer is not None, serial)]
 
     def __call__(self, iterates, loading, norms, system, islands) -> None:
         """Assemble the residuals at the iterate, with norms."""

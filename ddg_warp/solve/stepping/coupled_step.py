@@ -85,6 +85,8 @@ class CoupledStep(StepDriver):
             raise SceneError(
                 "contact: by the midpoint rule steps overshoot equilibrium and end in overlaps; use 'implicit_euler'"
             )
+        if solver.user_forces and self.midpoint:
+            raise SceneError("user-defined forces: the midpoint rule does not evaluate them; use 'implicit_euler'")
         self._lagged = model.coupled.lagged() if model.coupled.edges else None
         self._take = coupled_frames.take_kernel(real)
         self.motion = CoupledMotion(model, self.midpoint) if host.moves else None
@@ -93,6 +95,8 @@ class CoupledStep(StepDriver):
             scale = CoupledScale(model, self.coupled, solver)
             loads = ControlledLoads(model, self.coupled, self.midpoint, controls, scale)
         self.forces = forces_of(model, self.coupled, self.midpoint, loads)
+        if solver.user_forces:
+            self.forces.append(solver.user_forces)
         self.energy = CoupledEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.arcs = self._resolve_arcs()
         self.field = CoupledField(model, self.midpoint, integrator.field)

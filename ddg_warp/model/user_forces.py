@@ -1,0 +1,81 @@
+"""Parameters of user-defined forces on a device, and the nodes on which they act."""
+
+import numpy as np
+import warp as wp
+
+from ddg_warp import argument_checks
+from ddg_warp.kernels.forces.user_force import parameter_struct
+
+
+class UserForceArrays:
+    """User-defined force on the coupled system.
+
+    Attributes:
+        force: the `UserForce` of the scene.
+        places: dof blocks of its nodes (n,); a node that several rods share once.
+        parameters: values of each node in each world, a struct (worlds, n).
+        layout: name and number of components of each parameter.
+        version: counter of changes.
+    """
+
+    def __init__(self, force, host, worlds: int, device, real):
+        self.force, self.name, self.layout, self.worlds, self.version = force, force.name, force.layout, worlds, 0
+        rods = {rod.rod: rod.nodes for rod in host.rods}
+        blocks = [rods[rod][nodes] for rod, nodes in force.rods]
+        blocks = np.concatenate([*blocks, *(host.shells[shell].nodes[nodes] for shell, nodes in force.shells)])
+        self.rows = np.sort(np.unique(blocks, return_index=True)[1])
+        self.blocks = blocks[self.rows]
+        self.places = wp.array(self.blocks.astype(np.int32), dtype=int, device=device)
+        self.values, shape = {}, (worlds, len(self.rows))
+        for (name, size), values in zip(self.layout, force.parameters.values(), strict=True):
+            single = values if values.ndim < 1 + (size == 3) else values[self.rows]
+            self.values[name] = np.broadcast_to(single, (*shape, 3) if size == 3 else shape).copy()
+        self.parameters = wp.zeros(shape, dtype=parameter_struct(self.layout, real), device=device)
+        self._real = real
+        self._upload()
+
+    @property
+    def numbers(self) -> wp.array:
+        """Parameters as numbers (worlds, n, components), a view."""
+        size = sum(size for _, size in self.layout)
+        array = self.parameters
+        return wp.array(
+            ptr=array.ptr, dtype=self._real, shape=(*array.shape, size), device=array.device, copy=False, deleter=None
+        )
+
+    def columns(self, name: str) -> slice:
+        """Return the components of a parameter in `numbers`."""
+        first = 0
+        for other, size in self.layout:
+            if other == name:
+                return slice(first, first + size)
+            first += size
+        raise KeyError(name)
+
+    def set(self, name: str, values) -> None:
+        """Replace a parameter in place, which captured graphs read: one value, one a world, one a node, or one each.
+
+        Raises:
+            ValueError: a wrong name, shape or value.
+        """
+        if name not in self.values:
+            raise ValueError(f"set_parameter: {self.name} has no parameter {name!r}; it has {', '.join(self.values)}")
+        values, stored = argument_checks.array(f"{self.name}.{name}", values), self.values[name]
+        vector = stored.shape[2:]
+        shapes = (vector, (self.worlds, 1, *vector), stored.shape[1:], stored.shape)
+        if values.shape == (self.worlds, *vector) and values.shape not in (stored.shape[1:], stored.shape):
+            values = values.reshape(self.worlds, 1, *vector)
+        if values.shape not in shapes:
+            raise ValueError(
+                f"{self.name}.{name} has shape {values.shape}; give {vector or 'one number'}, {(self.worlds, *vector)}, "
+                f"{stored.shape[1:]} or {stored.shape}"
+            )
+        if not np.isfinite(values).all():
+            raise ValueError(f"{self.name}.{name} is not finite")
+        stored[:] = values
+        self.version += 1
+        self._upload()
+
+    def _upload(self) -> None:
+        numbers = [values.reshape(*values.shape[:2], -1) for values in self.values.values()]
+        self.numbers.assign(np.concatenate(numbers, axis=-1))

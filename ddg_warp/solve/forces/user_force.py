@@ -1,0 +1,114 @@
+"""User-defined forces in Newton's method on the coupled system; see `kernels.forces.user_force`.
+
+The force acts at every iterate, with its stiffness in the matrix. Blocks of nodes are added to their inertia; blocks between nodes act
+matrix-free, in the products of conjugate gradients. The line search takes the mean work of the forces along a step, which is exact for
+linear forces and needs no potential. Where the matrix is indefinite, it takes the positive part of the blocks of nodes, and leaves out
+forces between pairs.
+"""
+
+import warp as wp
+
+from ddg_warp.kernels.core.inertia import block_inertia
+from ddg_warp.kernels.forces import user_force
+from ddg_warp.solve.forces.force import Force
+from ddg_warp.timers import timer
+
+
+class UserForces(Force):
+    """User-defined forces of a `CoupledNewton`.
+
+    Args:
+        linear: scalar type of the linear algebra.
+        quadratic: True if blocks have a quadratic potential; see `kernels.core.inertia`.
+        contact: `ContactPotential` whose forces are added to, or None.
+
+    Attributes:
+        total, bound: forces on dof blocks (W N,) that elements, loads and inertia do not include, and bounds of their stiffness.
+        inertia: inertia of blocks (worlds, N) with the stiffness of the forces.
+        pairs: True if there are forces between pairs of nodes.
+        start, time: positions at the start of the solve (W N,), and time at its end (worlds,).
+    """
+
+    name = "user"
+
+    def __init__(self, model, linear, quadratic: bool, contact=None):
+        self.coupled = coupled = model.coupled
+        real, worlds, device = coupled.real, coupled.worlds, coupled.device
+        count, matrix = worlds * coupled.blocks, wp.types.matrix((3, 3), real)
+        self.parts, self.pairs = coupled.user_forces, any(part.force.pairs for part in coupled.user_forces)
+
+        def make(shape, dtype=real):
+            return wp.zeros(shape, dtype=dtype, device=device)
+
+        self._force, self.total, self.start = (make(shape, coupled.vector) for shape in ((2, count), count, count))
+        self._contact = [contact.forces, contact.blocks.stiffness] if contact else [make(0, coupled.vector), make(0)]
+        self.bound, self.stiffness = make(count), make(count, matrix)
+        self.inertia = make((worlds, coupled.blocks), block_inertia(real))
+        self.time, self._times = make(worlds), make(2)
+        self._clock, self._begin, self._clear = user_force.start_kernels(real)
+        self._work, self._inertia = user_force.finish_kernels(real, quadratic)
+        self._kernels = [
+            user_force.pair_kernels(part.force.function, part.layout, real, linear)
+            if part.force.pairs
+            else user_force.nodal_kernels(part.force.function, part.layout, real)
+            for part in self.parts
+        ]
+        self._q = self._flags = None
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        own = [self._clock, self._begin, self._clear, self._work, self._inertia]
+        return [*own, *(kernel for kernels in self._kernels for kernel in kernels[:-1])]
+
+    def upload(self, t0: float, t1: float) -> None:
+        """Upload the times of a step."""
+        self._times.assign([t0, t1])
+
+    def freeze(self, before, newton) -> None:
+        """Take the start of a solve, and the time at its end."""
+        wp.copy(self.start, before.q)
+        wp.launch(
+            self._clock, self.coupled.worlds, [newton.islands.arrays[1], self._times], [self.time], device=self.coupled.device
+        )
+
+    @timer("user forces")
+    def evaluate(self, q: wp.array, islands) -> None:
+        """Evaluate the forces at positions q, with those of contact in `total`."""
+        read = [*self._contact, self.stiffness, islands.arrays[0], self.coupled.blocks]
+        self._launch(self._begin, len(q), read, [self._force, self.total, self.bound])
+        for part, kernels in zip(self.parts, self._kernels, strict=True):
+            read = [part.places, part.parameters, q, self.start, self.time, *islands.arrays, self.coupled.blocks]
+            self._launch(kernels[0], part.parameters.shape, read, [self._force, self.total])
+
+    def account(self, iterates, norms, islands) -> None:
+        """Add the mean work of the forces along the step to the change of the energy."""
+        read = [iterates.proposed, iterates.base, self._force, islands.arrays[0], self.coupled.blocks]
+        self._launch(self._work, len(self.total), read, [norms.change, norms.rounding_error])
+
+    @timer("user forces")
+    def assemble(self, q: wp.array, mass: wp.array, islands) -> None:
+        """Write `inertia` at positions q in worlds that need a direction."""
+        self.linearise(q, islands)
+        read = [mass, self.stiffness, islands.arrays[0], self.coupled.blocks]
+        self._launch(self._inertia, len(q), read, [self.inertia])
+
+    def linearise(self, q: wp.array, islands) -> None:
+        """Write `stiffness` at positions q, for which `multiply` acts from now on."""
+        self._q, self._flags = q, islands.arrays[0]
+        self._launch(self._clear, len(q), [self._flags, self.coupled.blocks], [self.stiffness])
+        for part, kernels in zip(self.parts, self._kernels, strict=True):
+            read = [part.places, part.parameters, q, self.start, self.time, *islands.arrays, self.coupled.blocks]
+            self._launch(kernels[1], part.parameters.shape, read, [self.stiffness])
+
+    @timer("user forces")
+    def multiply(self, p: wp.array, product: wp.array, system) -> None:
+        """Add the products of the blocks between nodes to `product`, and write p . H p of these nodes."""
+        for part, kernels in zip(self.parts, self._kernels, strict=True):
+            if part.force.pairs:
+                read = [part.places, part.parameters, self._q, self._flags, system.masks.inactive, system.wanted]
+                read += [p, self.coupled.blocks]
+                self._launch(kernels[2], part.parameters.shape, read, [product, system.dots])
+
+    def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim, inputs, outputs, device=self.coupled.device)

@@ -1,0 +1,385 @@
+"""User-defined forces on nodes, and between all pairs of nodes.
+
+A nodal force is a function `force(x, v, t, p)` of position, velocity in the step, time and parameters. A pair force is a function
+`force(d, p, q)` on a node from another at the distance vector d, with the parameters p of the first node and q of the other. The
+opposite force acts on the other node, so that `force(-d, q, p)` is `-force(d, p, q)`; the derivative by d is symmetric. All derivatives
+come from automatic differentiation.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.core.inertia import block_inertia, mass_type
+from ddg_warp.kernels.core.islands import (
+    DROP_COMPRESSION,
+    ENERGY_BUFFER,
+    INVERSE_STEP,
+    NEEDS_DIRECTION,
+    STATUS,
+    STEP_PROGRESS,
+    SUBSTEP_FRACTION,
+)
+
+
+@cache
+def parameter_struct(layout: tuple[tuple[str, int], ...], real):
+    """Return the struct of the parameters of a node: (name, number of components, 1 or 3) each."""
+    fields = {name: real if size == 1 else wp.types.vector(3, real) for name, size in layout}
+    return wp.struct(type("Parameters", (), {"__annotations__": fields, "__module__": __name__}))
+
+
+@cache
+def numbers_function(layout: tuple[tuple[str, int], ...], real):
+    """Return the device function `numbers(p)`: the components of a parameter struct in one vector. Warp adds no structs."""
+    size, struct = sum(size for _, size in layout), parameter_struct(layout, real)
+    number = f"wp::{real.__name__}"
+
+    @wp.func_native(
+        snippet=f"""
+    wp::vec_t<{size}, {number}> result;
+    for (int i = 0; i < {size}; ++i) result[i] = reinterpret_cast<const {number}*>(&p)[i];
+    return result;
+    """
+    )
+    def numbers(p: struct) -> wp.types.vector(size, real): ...
+
+    return numbers
+
+
+@cache
+def start_kernels(real):
+    """Build the kernels that begin evaluations.
+
+    `clock`: write the time at the end of the current substep of each world.
+    `begin`: clear the forces of the iterate, and copy the forces of contact.
+    `clear`: clear the stiffness of worlds that need a direction.
+    """
+    V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def clock(scalars: wp.array2d(dtype=real), times: wp.array(dtype=real), time: wp.array(dtype=real)):
+        w = wp.tid()
+        part = wp.min(scalars[STEP_PROGRESS, w] + scalars[SUBSTEP_FRACTION, w], real(1.0))
+        time[w] = times[0] + part * (times[1] - times[0])
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def begin(
+        contact: wp.array(dtype=V),
+        pressed: wp.array(dtype=real),
+        stiffness: wp.array(dtype=M),
+        flags: wp.array2d(dtype=int),
+        blocks: int,
+        force: wp.array2d(dtype=V),
+        total: wp.array(dtype=V),
+        bound: wp.array(dtype=real),
+    ):
+        i = wp.tid()
+        w = i / blocks
+        if flags[STATUS, w] != 0:
+            return
+        force[1 - flags[ENERGY_BUFFER, w], i] = V()
+        largest = wp.max(wp.abs(wp.get_diag(stiffness[i])))
+        if contact.shape[0] > 0:
+            total[i] = contact[i]
+            bound[i] = pressed[i] + largest
+        else:
+            total[i] = V()
+            bound[i] = largest
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def clear(flags: wp.array2d(dtype=int), blocks: int, stiffness: wp.array(dtype=M)):
+        i = wp.tid()
+        if flags[NEEDS_DIRECTION, i / blocks] != 0:
+            stiffness[i] = M()
+
+    return clock, begin, clear
+
+
+@cache
+def finish_kernels(real, quadratic: bool):
+    """Build the kernels that end evaluations.
+
+    `work`: add the mean work of the forces along the step to the change of the energy.
+    `inertia`: add the stiffness to the inertia of blocks, which matrices take; where it was indefinite, its positive part.
+    """
+    V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def work(
+        q: wp.array(dtype=V),
+        base: wp.array(dtype=V),
+        force: wp.array2d(dtype=V),
+        flags: wp.array2d(dtype=int),
+        blocks: int,
+        change: wp.array2d(dtype=real),
+        rounding_error: wp.array2d(dtype=real),
+    ):
+        i = wp.tid()
+        w = i / blocks
+        if flags[STATUS, w] == 0:
+            k = i - w * blocks
+            made = real(0.5) * wp.dot(q[i] - base[i], force[0, i] + force[1, i])
+            change[w, k] = change[w, k] - made
+            rounding_error[w, k] = rounding_error[w, k] + wp.abs(made)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def inertia(
+        mass: mass_type(real, quadratic),
+        stiffness: wp.array(dtype=M),
+        flags: wp.array2d(dtype=int),
+        blocks: int,
+        out: wp.array2d(dtype=block_inertia(real)),
+    ):
+        i = wp.tid()
+        w = i / blocks
+        if flags[NEEDS_DIRECTION, w] == 0:
+            return
+        k = i - w * blocks
+        s = stiffness[i]
+        s = real(0.5) * (s + wp.transpose(s))
+        if flags[DROP_COMPRESSION, w] != 0 and wp.ddot(s, s) > real(0.0):
+            vectors, values = wp.eig3(s)
+            s = vectors * wp.diag(wp.max(values, V())) * wp.transpose(vectors)
+        if wp.static(quadratic):
+            s += mass[w, k].stiffness
+            out[w, k].mass = mass[w, k].mass
+        else:
+            out[w, k].mass = mass[w, k]
+        out[w, k].stiffness = s
+
+    return work, inertia
+
+
+@cache
+def nodal_kernels(function, layout: tuple[tuple[str, int], ...], real):
+    """Build the kernels of a nodal force: `evaluate`, `stiffen` (minus its derivative), `pull` (its reverse).
+
+    `pull` adds w . df to gradients by positions at the end and at the start, parameters, and the inverse step.
+    """
+    V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
+    struct, numbers, force = parameter_struct(layout, real), numbers_function(layout, real), function(real)
+    P = wp.types.vector(sum(size for _, size in layout), real)
+
+    @wp.func
+    def along(x: V, v: V, t: real, p: struct, w: V):
+        return wp.dot(w, force(x, v, t, p))
+
+    derivative = wp.grad(along)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def evaluate(
+        places: wp.array(dtype=int),
+        parameters: wp.array2d(dtype=struct),
+        q: wp.array(dtype=V),
+        start: wp.array(dtype=V),
+        time: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        blocks: int,
+        out: wp.array2d(dtype=V),
+        total: wp.array(dtype=V),
+    ):
+        w, k = wp.tid()
+        if flags[STATUS, w] != 0:
+            return
+        i = places[k] + w * blocks
+        f = force(q[i], (q[i] - start[i]) * scalars[INVERSE_STEP, w], time[w], parameters[w, k])
+        half = 1 - flags[ENERGY_BUFFER, w]
+        out[half, i] = out[half, i] + f
+        total[i] = total[i] + f
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def stiffen(
+        places: wp.array(dtype=int),
+        parameters: wp.array2d(dtype=struct),
+        q: wp.array(dtype=V),
+        start: wp.array(dtype=V),
+        time: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        blocks: int,
+        out: wp.array(dtype=M),
+    ):
+        w, k = wp.tid()
+        if flags[NEEDS_DIRECTION, w] == 0:
+            return
+        i = places[k] + w * blocks
+        rate = scalars[INVERSE_STEP, w]
+        s = M()
+        for d in range(3):
+            unit = V()
+            unit[d] = real(1.0)
+            by_x, by_v, _t, _p, _w = derivative(
+                q[i], (q[i] - start[i]) * rate, time[w], parameters[w, k], unit
+            )
+            row = by_x + by_v * rate
+            for c in range(3):
+                s[d, c] = -row[c]
+        out[i] = out[i] + s
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def pull(
+        places: wp.array(dtype=int),
+        parameters: wp.array2d(dtype=struct),
+        q: wp.array(dtype=V),
+        start: wp.array(dtype=V),
+        time: wp.array(dtype=real),
+        rate: real,
+        w: wp.array(dtype=V),
+        blocks: int,
+        by_q: wp.array(dtype=V),
+        by_start: wp.array(dtype=V),
+        by_rate: wp.array(dtype=real),
+        by_parameters: wp.array2d(dtype=P),
+    ):
+        world, k = wp.tid()
+        i = places[k] + world * blocks
+        change = q[i] - start[i]
+        by_x, by_v, _t, by_p, _w = derivative(q[i], change * rate, time[world], parameters[world, k], w[i])
+        by_q[i] = by_q[i] + by_x + by_v * rate
+        by_start[i] = by_start[i] - by_v * rate
+        by_rate[i] = by_rate[i] + wp.dot(by_v, change)
+        by_parameters[world, k] = numbers(by_p)
+
+    return evaluate, stiffen, pull
+
+
+@cache
+def pair_kernels(function, layout: tuple[tuple[str, int], ...], real, linear):
+    """Build the kernels of a pair force; one thread sums over all other nodes, in order.
+
+    `evaluate`, `stiffen`: as for a nodal force, with the diagonal blocks of the stiffness.
+    `multiply`: subtract the products of the other blocks with a vector.
+    `pull`: its reverse.
+    """
+    V, M, H = wp.types.vector(3, real), wp.types.matrix((3, 3), real), wp.types.vector(3, linear)
+    struct, numbers, force = parameter_struct(layout, real), numbers_function(layout, real), function(real)
+    P = wp.types.vector(sum(size for _, size in layout), real)
+
+    @wp.func
+    def along(d: V, p: struct, q: struct, w: V):
+        return wp.dot(w, force(d, p, q))
+
+    derivative = wp.grad(along)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def evaluate(
+        places: wp.array(dtype=int),
+        parameters: wp.array2d(dtype=struct),
+        q: wp.array(dtype=V),
+        start: wp.array(dtype=V),
+        time: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        blocks: int,
+        out: wp.array2d(dtype=V),
+        total: wp.array(dtype=V),
+    ):
+        w, k = wp.tid()
+        if flags[STATUS, w] != 0:
+            return
+        i = places[k] + w * blocks
+        p = parameters[w, k]
+        f = V()
+        for other in range(places.shape[0]):
+            if other != k:
+                f += force(q[places[other] + w * blocks] - q[i], p, parameters[w, other])
+        half = 1 - flags[ENERGY_BUFFER, w]
+        out[half, i] = out[half, i] + f
+        total[i] = total[i] + f
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def stiffen(
+        places: wp.array(dtype=int),
+        parameters: wp.array2d(dtype=struct),
+        q: wp.array(dtype=V),
+        start: wp.array(dtype=V),
+        time: wp.array(dtype=real),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        blocks: int,
+        out: wp.array(dtype=M),
+    ):
+        w, k = wp.tid()
+        if flags[NEEDS_DIRECTION, w] == 0 or flags[DROP_COMPRESSION, w] != 0:
+            return
+        i = places[k] + w * blocks
+        p = parameters[w, k]
+        s = M()
+        for other in range(places.shape[0]):
+            if other != k:
+                d = q[places[other] + w * blocks] - q[i]
+                for row in range(3):
+                    unit = V()
+                    unit[row] = real(1.0)
+                    by_d, _p, _q, _w = derivative(d, p, parameters[w, other], unit)
+                    for c in range(3):
+                        s[row, c] = s[row, c] + by_d[c]
+        out[i] = out[i] + s
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def multiply(
+        places: wp.array(dtype=int),
+        parameters: wp.array2d(dtype=struct),
+        q: wp.array(dtype=V),
+        flags: wp.array2d(dtype=int),
+        inactive: wp.array(dtype=wp.uint8),
+        wanted: wp.array(dtype=int),
+        v: wp.array(dtype=H),
+        blocks: int,
+        out: wp.array(dtype=H),
+        dots: wp.array2d(dtype=linear),
+    ):
+        w, k = wp.tid()
+        if wanted[w] != 1 or flags[DROP_COMPRESSION, w] != 0:
+            return
+        i = places[k] + w * blocks
+        p = parameters[w, k]
+        y = V()
+        for other in range(places.shape[0]):
+            if other != k:
+                j = places[other] + w * blocks
+                vj = V(real(v[j][0]), real(v[j][1]), real(v[j][2]))
+                by_d, _p, _q, _w = derivative(q[j] - q[i], p, parameters[w, other], vj)
+                y += by_d
+        mask = int(inactive[i])
+        total = out[i]
+        for d in range(3):
+            if ((mask >> d) & 1) == 0:
+                total[d] = total[d] - linear(y[d])
+        out[i] = total
+        dots[w, places[k]] = wp.dot(v[i], total)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def pull(
+        places: wp.array(dtype=int),
+        parameters: wp.array2d(dtype=struct),
+        q: wp.array(dtype=V),
+        start: wp.array(dtype=V),
+        time: wp.array(dtype=real),
+        rate: real,
+        w: wp.array(dtype=V),
+        blocks: int,
+        by_q: wp.array(dtype=V),
+        by_start: wp.array(dtype=V),
+        by_rate: wp.array(dtype=real),
+        by_parameters: wp.array2d(dtype=P),
+    ):
+        world, k = wp.tid()
+        i = places[k] + world * blocks
+        p = parameters[world, k]
+        by_x = V()
+        by_p = P()
+        for other in range(places.shape[0]):
+            if other != k:
+                j = places[other] + world * blocks
+                d = q[j] - q[i]
+                by_d, first, _q, _w = derivative(d, p, parameters[world, other], w[i])
+                back, _p, second, _v = derivative(-d, parameters[world, other], p, w[j])
+                by_x += back - by_d
+                by_p += numbers(first) + numbers(second)
+        by_q[i] = by_q[i] + by_x
+        by_parameters[world, k] = by_p
+
+    return evaluate, stiffen, multiply, pull
