@@ -24,6 +24,7 @@ class CoupledLinearSolve:
         quadratic: adjoint of the force with a quadratic potential, see `adjoint.forces`; None without.
         contact: `ExactContact`, evaluated at the solution of a step; None without contact.
         steps: True for steps.
+        user_forces: `UserForces` at the solution; None without.
 
     Attributes:
         system: `ExactSystem`; None for equilibria.
@@ -31,10 +32,11 @@ class CoupledLinearSolve:
         held: of the last host solve, the load-stiffness term of the gradient by fixed dofs (W N,); None without follower loads.
     """
 
-    def __init__(self, model, quadratic, contact, steps: bool):
+    def __init__(self, model, quadratic, contact, steps: bool, user_forces=None):
         coupled = self.coupled = model.coupled
-        self.model, self._quadratic = model, quadratic
-        self.system = ExactSystem(model, quadratic and quadratic.inertia, contact) if steps else None
+        self.model, self._quadratic, self._user_forces = model, quadratic, user_forces
+        inertia = quadratic and quadratic.inertia
+        self.system = ExactSystem(model, inertia, contact, user_forces) if steps else None
         self.failed = self.system and self.system.failed
         self.held = None
         self._rate = wp.zeros(coupled.worlds, dtype=coupled.real, device=coupled.device)
@@ -84,6 +86,8 @@ class CoupledLinearSolve:
             )
         tangent, host = self.tangent, self._host
         more = self._quadratic.matrix if self._quadratic else None
+        if self._user_forces and rate:  # those of an equilibrium are follower loads
+            friction_jacobian = self._user_forces.matrix()
         rhs = tangent.into(rhs.numpy().astype(float).ravel())
         solution = host(
             SimpleNamespace(coupled=state), rate, coefficient, None if rate else time, rhs, more, friction_jacobian

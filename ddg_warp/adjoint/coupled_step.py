@@ -16,6 +16,7 @@ from ddg_warp.adjoint.coupled_linear_solve import CoupledLinearSolve
 from ddg_warp.adjoint.coupled_predictor import CoupledPredictor
 from ddg_warp.adjoint.forces import ForceCotangents, force_adjoints, quadratic_of
 from ddg_warp.adjoint.supports import Supports
+from ddg_warp.adjoint.user_force import UserForceAdjoint
 from ddg_warp.kernels.adjoint import coupled_step, elements, time_step
 from ddg_warp.kernels.elements.coupled_element import FRAME, coupled_storage
 from ddg_warp.model.coupled_model import CoupledState
@@ -56,7 +57,8 @@ class CoupledInputs:
         held: by the prescribed positions of fixed dofs at the solution (W N,).
         coefficients: by coefficients of edges (rows, W edges), by name of the force.
         rate, damping, gravity: by the quantities common to all blocks, one entry per block (W N,).
-        elements_rate: by the rate, of every set (W E,), of forces on edges and of friction.
+        elements_rate: by the rate, of every set (W E,), of forces on edges, of user-defined forces (W N,) and of friction.
+        user_forces: by the parameters of each user-defined force (worlds, nodes) of all components.
         contact_parameters, radius: by the parameters of contact, see `ContactAdjoint`; None without contact.
     """
 
@@ -73,6 +75,7 @@ class CoupledInputs:
     elements_rate: list[wp.array]
     contact_parameters: wp.array | None = None
     radius: wp.array | None = None
+    user_forces: list[wp.array] = field(default_factory=list)
 
 
 @dataclass
@@ -121,9 +124,17 @@ class CoupledStepAdjoint:
         self._shares = CoupledAssembly(model)
         self.forces = force_adjoints(model, coupled, midpoint) if scheme else []
         self._quadratic = quadratic_of(self.forces)
+        self.user_forces = None
+        if coupled.user_forces:
+            self.user_forces = UserForceAdjoint(model, self._quadratic is not None)
+            self.forces.append(self.user_forces)
         self.contact = ContactAdjoint(coupled) if host.contact_parameters else None
         self.solve = CoupledLinearSolve(
-            model, self._quadratic, self.contact and self.contact.system, scheme is not None
+            model,
+            self._quadratic,
+            self.contact and self.contact.system,
+            scheme is not None,
+            self.user_forces and self.user_forces.force,
         )
         self.gravity = wp.array(
             np.tile(model.scene.gravity, (coupled.worlds, 1)), dtype=coupled.vector, device=self.device
@@ -176,6 +187,9 @@ class CoupledStepAdjoint:
         )
         if self._quadratic:
             self._inputs.elements_rate.append(self._quadratic.by_rate)
+        if self.user_forces:
+            self._inputs.user_forces = self.user_forces.by_parameters
+            self._inputs.elements_rate.append(self.user_forces.by_rate)
         if self.contact:
             self._inputs.contact_parameters, self._inputs.radius = self.contact.by_groups, self.contact.by_radius
             self._inputs.elements_rate.append(self.contact.grad_inverse_step)
@@ -265,6 +279,8 @@ class CoupledStepAdjoint:
         # the solve
         if self._quadratic:
             self._quadratic.resist(before, tangents, rate)
+        if self.user_forces:
+            self.user_forces.begin(before, kept.time if s == np.inf else None)
         points, components, grid = coupled.points, coupled.components, (coupled.worlds, coupled.blocks)
         self._rates.fill_(rate)
         end, out, began, more = *map(coupled.node_state, (cotangent, start, before)), components(by_end)

@@ -80,7 +80,18 @@ class UserForces:
         self._add_user_force("add_pair_force", name, function, True, **options)
 
     def _add_user_force(
-        self, call, name, function, pairs, *, parameters=None, potential=None, rods=None, nodes=None, shells=None, vertices=None
+        self,
+        call,
+        name,
+        function,
+        pairs,
+        *,
+        parameters=None,
+        potential=None,
+        rods=None,
+        nodes=None,
+        shells=None,
+        vertices=None,
     ) -> None:
         argument_checks.text(f"{call}: name", name)
         if not name.isidentifier() or any(name == force.name for force in self.user_forces):
@@ -92,7 +103,11 @@ class UserForces:
             raise SceneError(f"{call} {name!r}: parameters = {parameters!r}; give a dictionary from names to values")
         everything = rods is None and shells is None
         rods = np.arange(self.rod_count) if everything else [] if rods is None else self._rods(rods)
-        shells = range(len(self.shells)) if everything else argument_checks.indices("shells", [] if shells is None else shells)
+        shells = (
+            range(len(self.shells))
+            if everything
+            else argument_checks.indices("shells", [] if shells is None else shells)
+        )
         places = []
         for rod in argument_checks.once(f"{call}: rods", np.asarray(rods, int)).tolist():
             chosen = self._on_rods(call, rod, "node", nodes if nodes is not None else slice(None))[1]
@@ -107,7 +122,9 @@ class UserForces:
         for key, values in (parameters or {}).items():
             force.parameters[key] = parameter(f"{call} {name!r}: {key}", values, force.count)
         if not force.parameters:
-            raise SceneError(f"{call} {name!r}: it has no parameters; give one at least, such as parameters={{'stiffness': 1.0}}")
+            raise SceneError(
+                f"{call} {name!r}: it has no parameters; give one at least, such as parameters={{'stiffness': 1.0}}"
+            )
         self.user_forces.append(force)
 
 
@@ -132,11 +149,15 @@ def _check_function(label: str, factory, arguments: tuple[str, ...]) -> None:
     import warp as wp
 
     if isinstance(factory, wp.Function) or not callable(factory):
-        raise SceneError(f"{label} is {factory!r}; give a function of the scalar type `real` that returns a Warp function")
+        raise SceneError(
+            f"{label} is {factory!r}; give a function of the scalar type `real` that returns a Warp function"
+        )
     for real in (wp.float32, wp.float64):
         function = factory(real)
         if not isinstance(function, wp.Function):
-            raise SceneError(f"{label} returns {function!r} for {real.__name__}; return a function decorated by wp.func")
+            raise SceneError(
+                f"{label} returns {function!r} for {real.__name__}; return a function decorated by wp.func"
+            )
         if len(function.input_types) != len(arguments):
             raise SceneError(
                 f"{label} has the arguments ({', '.join(function.input_types)}); they are ({', '.join(arguments)})"

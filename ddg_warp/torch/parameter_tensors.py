@@ -7,7 +7,7 @@ import warp as wp
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core import outcome
 from ddg_warp.model.parameters import valid_numbers
-from ddg_warp.torch import named_parameters
+from ddg_warp.torch import named_parameters, user_force_parameters
 from ddg_warp.torch.parameter_storage import ArrayParameterView, TermParameterView
 
 
@@ -35,11 +35,12 @@ class ParameterTensors:
         if not isinstance(name, str):
             raise SceneError(f"parameters: {name!r} is no name; this model has {', '.join(self.names())}")
         if name not in self._found:
-            storage = (
-                named_parameters.array_views(self.model, name)
-                if name in named_parameters.NAMES
-                else self._of_terms(name)
-            )
+            if name in user_force_parameters.names(self.model):
+                storage = user_force_parameters.array_views(self.model, name)
+            elif name in named_parameters.NAMES:
+                storage = named_parameters.array_views(self.model, name)
+            else:
+                storage = self._of_terms(name)
             if any(isinstance(view, TermParameterView) and view.prescribed for view in storage[1]):
                 raise SceneError(
                     f"parameters: {name} is prescribed by a field of the scene; give controls={{'fields': {{name: tensor}}}}"
@@ -68,7 +69,8 @@ class ParameterTensors:
         for part in model.coupled.sets if model.coupled is not None else ():
             result.update(f"{part.term.name}.{name}" for name in part.parameters.values)
         return sorted(result) + [
-            name for name in named_parameters.NAMES if named_parameters.array_views(model, name)[1]
+            *(name for name in named_parameters.NAMES if named_parameters.array_views(model, name)[1]),
+            *user_force_parameters.names(model),
         ]
 
     def full_of(self, name: str, values: torch.Tensor) -> list[torch.Tensor]:
@@ -118,7 +120,9 @@ class ParameterTensors:
     def rule(self, name: str) -> tuple:
         """Return the rule for values of a parameter in words, and a function that tests values."""
         if name not in self._rules:
-            if name in named_parameters.NAMES:
+            if name in user_force_parameters.names(self.model):
+                self._rules[name] = "a number", np.isfinite
+            elif name in named_parameters.NAMES:
                 self._rules[name] = named_parameters.rule(name, self._usual(name))
             else:
                 term, parameter = name.rsplit(".", 1)

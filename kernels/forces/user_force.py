@@ -54,14 +54,15 @@ def start_kernels(real):
     `clock`: write the time at the end of the current substep of each world.
     `begin`: clear the forces of the iterate, and copy the forces of contact.
     `clear`: clear the stiffness of worlds that need a direction.
+    `unsymmetric`: mark worlds with an unsymmetric stiffness of a node.
     """
     V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def clock(scalars: wp.array2d(dtype=real), times: wp.array(dtype=real), time: wp.array(dtype=real)):
+    def clock(scalars: wp.array2d(dtype=real), times: wp.array2d(dtype=real), time: wp.array(dtype=real)):
         w = wp.tid()
         part = wp.min(scalars[STEP_PROGRESS, w] + scalars[SUBSTEP_FRACTION, w], real(1.0))
-        time[w] = times[0] + part * (times[1] - times[0])
+        time[w] = times[0, w] + part * (times[1, w] - times[0, w])
 
     @wp.kernel(module="unique", enable_backward=False)
     def begin(
@@ -93,7 +94,15 @@ def start_kernels(real):
         if flags[NEEDS_DIRECTION, i / blocks] != 0:
             stiffness[i] = M()
 
-    return clock, begin, clear
+    @wp.kernel(module="unique", enable_backward=False)
+    def unsymmetric(stiffness: wp.array(dtype=M), tolerance: real, blocks: int, failed: wp.array(dtype=int)):
+        i = wp.tid()
+        s = stiffness[i]
+        difference = s - wp.transpose(s)
+        if wp.ddot(difference, difference) > tolerance * tolerance * wp.ddot(s, s):
+            failed[i / blocks] = 1
+
+    return clock, begin, clear, unsymmetric
 
 
 @cache
@@ -210,9 +219,7 @@ def nodal_kernels(function, layout: tuple[tuple[str, int], ...], real):
         for d in range(3):
             unit = V()
             unit[d] = real(1.0)
-            by_x, by_v, _t, _p, _w = derivative(
-                q[i], (q[i] - start[i]) * rate, time[w], parameters[w, k], unit
-            )
+            by_x, by_v, _t, _p, _w = derivative(q[i], (q[i] - start[i]) * rate, time[w], parameters[w, k], unit)
             row = by_x + by_v * rate
             for c in range(3):
                 s[d, c] = -row[c]
@@ -225,7 +232,7 @@ def nodal_kernels(function, layout: tuple[tuple[str, int], ...], real):
         q: wp.array(dtype=V),
         start: wp.array(dtype=V),
         time: wp.array(dtype=real),
-        rate: real,
+        rates: wp.array(dtype=real),
         w: wp.array(dtype=V),
         blocks: int,
         by_q: wp.array(dtype=V),
@@ -236,6 +243,7 @@ def nodal_kernels(function, layout: tuple[tuple[str, int], ...], real):
         world, k = wp.tid()
         i = places[k] + world * blocks
         change = q[i] - start[i]
+        rate = rates[world]
         by_x, by_v, _t, by_p, _w = derivative(q[i], change * rate, time[world], parameters[world, k], w[i])
         by_q[i] = by_q[i] + by_x + by_v * rate
         by_start[i] = by_start[i] - by_v * rate
@@ -251,6 +259,7 @@ def pair_kernels(function, layout: tuple[tuple[str, int], ...], real, linear):
 
     `evaluate`, `stiffen`: as for a nodal force, with the diagonal blocks of the stiffness.
     `multiply`: subtract the products of the other blocks with a vector.
+    `blocks_of`: write the other blocks.
     `pull`: its reverse.
     """
     V, M, H = wp.types.vector(3, real), wp.types.matrix((3, 3), real), wp.types.vector(3, linear)
@@ -352,13 +361,33 @@ def pair_kernels(function, layout: tuple[tuple[str, int], ...], real, linear):
         dots[w, places[k]] = wp.dot(v[i], total)
 
     @wp.kernel(module="unique", enable_backward=False)
+    def blocks_of(
+        places: wp.array(dtype=int),
+        parameters: wp.array2d(dtype=struct),
+        q: wp.array(dtype=V),
+        blocks: int,
+        out: wp.array3d(dtype=M),
+    ):
+        w, k, other = wp.tid()
+        s = M()
+        if other != k:
+            d = q[places[other] + w * blocks] - q[places[k] + w * blocks]
+            for row in range(3):
+                unit = V()
+                unit[row] = real(1.0)
+                by_d, _p, _q, _w = derivative(d, parameters[w, k], parameters[w, other], unit)
+                for c in range(3):
+                    s[row, c] = -by_d[c]
+        out[w, k, other] = s
+
+    @wp.kernel(module="unique", enable_backward=False)
     def pull(
         places: wp.array(dtype=int),
         parameters: wp.array2d(dtype=struct),
         q: wp.array(dtype=V),
         start: wp.array(dtype=V),
         time: wp.array(dtype=real),
-        rate: real,
+        rates: wp.array(dtype=real),
         w: wp.array(dtype=V),
         blocks: int,
         by_q: wp.array(dtype=V),
@@ -382,4 +411,4 @@ def pair_kernels(function, layout: tuple[tuple[str, int], ...], real, linear):
         by_q[i] = by_q[i] + by_x
         by_parameters[world, k] = by_p
 
-    return evaluate, stiffen, multiply, pull
+    return evaluate, stiffen, multiply, blocks_of, pull

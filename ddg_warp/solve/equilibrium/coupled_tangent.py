@@ -8,6 +8,7 @@ from scipy import sparse
 
 from ddg_warp.compile.residual_tolerance import largest_excess
 from ddg_warp.geometry.edge_rotation import turned
+from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.coupled_element import coupled_storage, linear_stress_kernel
 from ddg_warp.model import validate
@@ -16,6 +17,7 @@ from ddg_warp.solve.collision import exact_hessian
 from ddg_warp.solve.equilibrium.rigid_modes import Body
 from ddg_warp.solve.equilibrium.tangent_part import TangentBlock
 from ddg_warp.solve.forces.prescribed_element_data import CoupledMotion
+from ddg_warp.solve.forces.user_force import UserForces
 from ddg_warp.solve.linear.skew_supports import HostPlanes
 
 
@@ -36,6 +38,37 @@ class CoupledTangent(TangentBlock):
         self._anchored = host.fixed[: host.nodes].copy()
         for shell in host.shells:
             self._anchored[shell.nodes] = True
+
+    @cached_property
+    def _user_forces(self) -> UserForces | None:
+        """User-defined forces, at rest; None without."""
+        return UserForces(self.model, self.coupled.real, False) if self.coupled.user_forces else None
+
+    def _user_forces_at(self, factor: float, q: np.ndarray) -> tuple[UserForces, wp.array, Islands]:
+        """Return user-defined forces at dofs q and a load parameter, with blocks and islands for their evaluation."""
+        forces, islands = self._user_forces, Islands(self.coupled.worlds, self.coupled.real, self.coupled.device)
+        islands.needs_direction.fill_(1)
+        blocks = wp.array(self.back(q).reshape(-1, 3), dtype=self.coupled.vector, device=self.coupled.device)
+        forces.upload(factor, factor)
+        forces.start_at(blocks)
+        return forces, blocks, islands
+
+    def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
+        result = super().loads(factor, q)
+        if not self.coupled.user_forces:
+            return result
+        forces, blocks, islands = self._user_forces_at(factor, q)
+        forces.evaluate(blocks, islands)
+        return result + self.into(forces.total.numpy().astype(float).ravel())
+
+    def load_stiffness(self, factor: float, q: np.ndarray) -> sparse.csc_matrix | None:
+        result = super().load_stiffness(factor, q)
+        if not self.coupled.user_forces:
+            return result
+        forces, blocks, islands = self._user_forces_at(factor, q)
+        forces.linearise(blocks, islands)
+        stiffness = self.matrix(forces.matrix())
+        return stiffness if result is None else result + stiffness
 
     def accelerations(self, gravity: np.ndarray) -> np.ndarray:
         return np.where(np.arange(self.host.blocks)[:, None] < self.host.nodes, gravity, 0.0)

@@ -111,6 +111,9 @@ class StaticNewton(CoupledNewton):
                 self.slid.assign(slid)
         for force in (self.loading.force, self._base_force):
             force.assign(dead.reshape(-1, 3))
+        if self.user_forces:
+            self.user_forces.upload(load_factor, load_factor)
+            self.user_forces.start_at(self.iterates.q)
         if self.loads:
             self.loads.scale(dead.reshape(self.coupled.worlds, -1, 3), load_factor)
         wp.copy(self.islands.load_scale, self.tolerances.assign(scale.reshape(self.coupled.worlds, -1)))
@@ -224,7 +227,7 @@ class CoupledEquilibrium:
                 max_iterations=options.max_iterations,
                 rotation_cap=options.rotation_cap,
                 linear_rtol=FORCING,
-                psd="progressive" if contact_parameters else "gauss_newton",
+                psd="progressive" if contact_parameters or model.coupled.user_forces else "gauss_newton",
             ),
         )
         self.arcs = Arcs(model) if contact_parameters and model.motions else None

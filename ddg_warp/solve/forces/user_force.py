@@ -6,12 +6,18 @@ linear forces and needs no potential. Where the matrix is indefinite, it takes t
 forces between pairs.
 """
 
+import numpy as np
 import warp as wp
+from scipy import sparse
 
+from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core.inertia import block_inertia
 from ddg_warp.kernels.forces import user_force
 from ddg_warp.solve.forces.force import Force
+from ddg_warp.solve.linear.solver_selection import MOST_PAIRED
 from ddg_warp.timers import timer
+
+UNSYMMETRIC = 2.0**20  # unit roundoffs by which a symmetric stiffness may be unsymmetric
 
 
 class UserForces(Force):
@@ -44,8 +50,9 @@ class UserForces(Force):
         self._contact = [contact.forces, contact.blocks.stiffness] if contact else [make(0, coupled.vector), make(0)]
         self.bound, self.stiffness = make(count), make(count, matrix)
         self.inertia = make((worlds, coupled.blocks), block_inertia(real))
-        self.time, self._times = make(worlds), make(2)
-        self._clock, self._begin, self._clear = user_force.start_kernels(real)
+        self.time, self._times = make(worlds), make((2, worlds))
+        self._clock, self._begin, self._clear, self._unsymmetric = user_force.start_kernels(real)
+        self.tolerance = UNSYMMETRIC * model.types.eps
         self._work, self._inertia = user_force.finish_kernels(real, quadratic)
         self._kernels = [
             user_force.pair_kernels(part.force.function, part.layout, real, linear)
@@ -58,19 +65,33 @@ class UserForces(Force):
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [self._clock, self._begin, self._clear, self._work, self._inertia]
+        own = [self._clock, self._begin, self._clear, self._unsymmetric, self._work, self._inertia]
         return [*own, *(kernel for kernels in self._kernels for kernel in kernels[:-1])]
 
     def upload(self, t0: float, t1: float) -> None:
         """Upload the times of a step."""
-        self._times.assign([t0, t1])
+        self._times.assign(np.repeat([[t0], [t1]], self.coupled.worlds, axis=1))
 
     def freeze(self, before, newton) -> None:
         """Take the start of a solve, and the time at its end."""
         wp.copy(self.start, before.q)
         wp.launch(
-            self._clock, self.coupled.worlds, [newton.islands.arrays[1], self._times], [self.time], device=self.coupled.device
+            self._clock,
+            self.coupled.worlds,
+            [newton.islands.arrays[1], self._times],
+            [self.time],
+            device=self.coupled.device,
         )
+
+    @property
+    def pulls(self) -> list:
+        """Kernels of the reverse of each force."""
+        return [kernels[-1] for kernels in self._kernels]
+
+    def start_at(self, q: wp.array) -> None:
+        """Take positions q at the start of a solve, which ends at the end of the uploaded times."""
+        wp.copy(self.start, q)
+        wp.copy(self.time, self._times[1])
 
     @timer("user forces")
     def evaluate(self, q: wp.array, islands) -> None:
@@ -109,6 +130,37 @@ class UserForces(Force):
                 read = [part.places, part.parameters, self._q, self._flags, system.masks.inactive, system.wanted]
                 read += [p, self.coupled.blocks]
                 self._launch(kernels[2], part.parameters.shape, read, [product, system.dots])
+
+    def refuse_unsymmetric(self, failed: wp.array) -> None:
+        """Mark worlds with an unsymmetric stiffness, which conjugate gradients do not solve (worlds,)."""
+        inputs = [self.stiffness, self.tolerance, self.coupled.blocks]
+        self._launch(self._unsymmetric, len(self.stiffness), inputs, [failed])
+
+    def matrix(self) -> sparse.csc_matrix:
+        """Return the stiffness at the positions of `linearise`, in dof blocks of space components.
+
+        Raises:
+            SceneError: pairs of too many nodes.
+        """
+        coupled, size = self.coupled, 3 * len(self.stiffness)
+        result = sparse.block_diag(self.stiffness.numpy().astype(float), format="csc")
+        for part, kernels in zip(self.parts, self._kernels, strict=True):
+            count = len(part.blocks)
+            if part.force.pairs and count > MOST_PAIRED:
+                raise SceneError(
+                    f"{part.name}: a matrix of pairs of {count} nodes is too large, {MOST_PAIRED} at most; take solver='pcg' for equilibria, "
+                    "and fewer nodes for their stability and gradients"
+                )
+            if part.force.pairs:
+                blocks = wp.zeros((coupled.worlds, count, count), dtype=self.stiffness.dtype, device=coupled.device)
+                read = [part.places, part.parameters, self._q, coupled.blocks]
+                self._launch(kernels[3], blocks.shape, read, [blocks])
+                places = 3 * (coupled.blocks * np.arange(coupled.worlds)[:, None] + part.blocks)
+                dofs = places[..., None] + np.arange(3)
+                rows, columns = np.broadcast_arrays(dofs[:, :, None, :, None], dofs[:, None, :, None, :])
+                entries = blocks.numpy().astype(float).ravel(), (rows.ravel(), columns.ravel())
+                result = result + sparse.csc_matrix(entries, shape=(size, size))
+        return result
 
     def _launch(self, kernel, dim, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim, inputs, outputs, device=self.coupled.device)

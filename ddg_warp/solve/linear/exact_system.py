@@ -31,6 +31,7 @@ class ExactSystem:
     Args:
         inertia: inertia of the blocks (worlds, N) with a quadratic potential; None without potential.
         contact: `ExactContact` at the solution; None without contact.
+        user_forces: `UserForces` at the solution; None without.
 
     Attributes:
         tolerance: residual after conjugate gradients, relative, in the norm of their preconditioner.
@@ -41,8 +42,8 @@ class ExactSystem:
     tolerance = 1e-12
     missed = 1e-6
 
-    def __init__(self, model, inertia: wp.array | None = None, contact=None):
-        self.contact = contact
+    def __init__(self, model, inertia: wp.array | None = None, contact=None, user_forces=None):
+        self.contact, self.user_forces = contact, user_forces
         coupled, real = model.coupled, model.types.real
         self.coupled, self.device, self.linear = coupled, coupled.device, wp.float64
         worlds, host, device = coupled.worlds, coupled.host, coupled.device
@@ -50,7 +51,9 @@ class ExactSystem:
         def make(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        preconditioner, quadratic = coupled_preconditioner(coupled), inertia is not None
+        self.mass = coupled.mass if inertia is None else inertia
+        preconditioner = coupled_preconditioner(coupled)
+        quadratic = coupled.has_quadratic_matrix(inertia is not None)
         self.substructuring = RodSubstructuring.of(coupled, preconditioner, banded=False)
         self.sparsity = SparseSystem(coupled)
         self.planes = SkewSupports(coupled, self.sparsity, real, self.linear) if host.frames else None
@@ -58,7 +61,6 @@ class ExactSystem:
             self.substructuring.bind(self.sparsity, [], self.linear, (), quadratic)
             if contact:
                 contact.hessian.bind(self.substructuring)
-        self.mass = inertia if quadratic else coupled.mass
         self.islands = Islands(worlds, real, device)
         wanted = self.islands.needs_direction
         self.system = LinearSystem.of(coupled, self.sparsity, self.substructuring, self.linear, wanted, wanted)
@@ -77,13 +79,24 @@ class ExactSystem:
         self._ends = [wp.array(_ends(part.term.measure), dtype=int, device=device) for part in coupled.sets]
         multilevel, hessian = preconditioner.endswith("multilevel"), contact and contact.hessian
         self.krylov = PCG(
-            coupled, self.sparsity, self.substructuring, hessian, self.linear, multilevel, indefinite=True
+            coupled,
+            self.sparsity,
+            self.substructuring,
+            hessian,
+            self.linear,
+            multilevel,
+            indefinite=True,
+            user_forces=user_forces,
         )
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        used = [part.kernels for part in (self.krylov, self.substructuring, self.planes, self.contact) if part]
+        used = [
+            part.kernels
+            for part in (self.krylov, self.substructuring, self.planes, self.contact, self.user_forces)
+            if part
+        ]
         result = [self._begin, self._add, self._into, self._back, self._keep, self._rest, self._check]
         return [*result, *self._hessians, *(kernel for kernels in used for kernel in kernels)]
 
@@ -120,8 +133,12 @@ class ExactSystem:
     def assemble(self, state: CoupledState, rate: wp.array) -> None:
         """Assemble H of all worlds."""
         system, table, flags = self.system, self.sparsity, self.islands.arrays[0]
-        every = device_arrays.takers(system.matrix.shape[1], self.device)
-        read = [self.mass, *self.islands.arrays, table.rows, table.columns, table.positions]
+        every, mass = device_arrays.takers(system.matrix.shape[1], self.device), self.mass
+        if self.user_forces:
+            wp.copy(self.islands.inverse_step, rate)
+            self.user_forces.assemble(state.q, mass, self.islands)
+            mass = self.user_forces.inertia
+        read = [mass, *self.islands.arrays, table.rows, table.columns, table.positions]
         self._launch(self._begin, every, read, [system.matrix])
         for i, (kernel, hessian) in enumerate(zip(self._hessians, self._written, strict=True)):
             inputs = self.coupled.elements(state, i, rate=rate)
@@ -139,7 +156,7 @@ class ExactSystem:
         if self.planes:
             self.planes.matrix(system.matrix, system.wanted)
         if self.substructuring:
-            self.substructuring.bands.assemble(system.matrix, self.mass, self.islands)
+            self.substructuring.bands.assemble(system.matrix, mass, self.islands)
         if self.contact:
             self.contact.hessian.assemble()
             self.contact.hessian.add_to_bands(flags)
@@ -154,6 +171,8 @@ class ExactSystem:
         krylov.precondition(system, krylov.z)
         krylov.sum(system.dots, krylov.total)
         self._launch(self._check, self.coupled.worlds, [krylov.total, krylov.rho_first, self.missed], [self.failed])
+        if self.user_forces:
+            self.user_forces.refuse_unsymmetric(self.failed)
 
     def _give(self, values: wp.array, out: wp.array) -> None:
         """Write blocks in the precision of the model, in spatial components."""

@@ -63,6 +63,10 @@ def long_and_few(nodes: int, columns: int, device, repeated: bool = False) -> bo
 LARGE_STATIC = {False: 50_000, True: 4_000}
 
 
+# Nodes of a pair force whose stiffness, a full matrix, is factorised.
+MOST_PAIRED = 1000
+
+
 def static_solver(model) -> str:
     """Return the static solver: "pcg" for contact and for large supported coupled systems, else "direct"."""
     coupled = model.coupled
@@ -70,7 +74,8 @@ def static_solver(model) -> str:
         return "pcg"
     if coupled is None or why_not_pcg(model):
         return "direct"
-    return "pcg" if large_static(model) else "direct"
+    dense = any(part.force.pairs and len(part.blocks) > MOST_PAIRED for part in coupled.user_forces)
+    return "pcg" if dense or large_static(model) else "direct"
 
 
 def large_static(model) -> bool:
