@@ -86,7 +86,7 @@ class CoupledLinearSolve:
             )
         tangent, host = self.tangent, self._host
         more = self._quadratic.matrix if self._quadratic else None
-        if self._user_forces and rate:  # those of an equilibrium are follower loads
+        if self._user_forces and rate:  # the tangent of an equilibrium has their stiffness
             friction_jacobian = self._user_forces.matrix()
         rhs = tangent.into(rhs.numpy().astype(float).ravel())
         solution = host(

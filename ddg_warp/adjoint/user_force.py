@@ -44,11 +44,11 @@ class UserForceAdjoint:
         self.force.start_at(before.q)
 
     def vjp(self, pull) -> None:
-        """Add the gradients by positions and rate, and write those by parameters."""
+        """Add the gradients by positions and rate, and write gradients by parameters."""
         force, coupled = self.force, self.coupled
         for part, kernel, by_parameters in zip(force.parts, force.pulls, self.by_parameters, strict=True):
             read = [
-                part.places,
+                part.nodes,
                 part.parameters,
                 pull.solved.q,
                 force.start,

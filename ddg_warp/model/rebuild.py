@@ -26,6 +26,10 @@ class ModelBuilder:
             {name: _in_worlds(name, values, axis, model.worlds, worlds) for name, values in table.values.items()}
             for table, axis in _tables(model)
         ]
+        self.user_forces = [
+            {name: _in_worlds(name, values, 0, model.worlds, worlds) for name, values in force.values.items()}
+            for force in _user_forces(model)
+        ]
         self.plates = [shell.plate for shell in _shells(model)]
 
     def build(self):
@@ -41,6 +45,9 @@ class ModelBuilder:
         for (table, _), values in zip(_tables(model), self.parameters, strict=True):
             changed = {name: new for name, new in values.items() if not np.array_equal(table.values[name], new)}
             remade |= bool(changed) and table.set(**changed)
+        for force, values in zip(_user_forces(model), self.user_forces, strict=True):
+            for name, new in values.items():
+                force.set(name, new if len(new) == model.worlds else new[0])
         for shell, plate in zip(_shells(model), self.plates, strict=True):
             shell.plate = plate
         model.note_change(remade)
@@ -50,6 +57,10 @@ def _tables(model) -> list:
     """Return parameter tables of rod groups and element sets, each with its axis of worlds."""
     sets = model.coupled.sets if model.coupled is not None else ()
     return [(group.parameters, 1) for group in model.groups] + [(part.parameters, 0) for part in sets]
+
+
+def _user_forces(model) -> list:
+    return model.coupled.user_forces if model.coupled is not None else []
 
 
 def _shells(model) -> list:

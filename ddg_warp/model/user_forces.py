@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import argument_checks
-from ddg_warp.kernels.forces.user_force import parameter_struct
+from ddg_warp.kernels.forces.user_force import energy_kernel, parameter_struct
 
 
 class UserForceArrays:
@@ -12,7 +12,7 @@ class UserForceArrays:
 
     Attributes:
         force: the `UserForce` of the scene.
-        places: dof blocks of its nodes (n,); a node that several rods share once.
+        blocks, nodes: dof blocks (n,) on which it acts, on the host and the device. A joint counts once.
         parameters: values of each node in each world, a struct (worlds, n).
         layout: name and number of components of each parameter.
         version: counter of changes.
@@ -25,7 +25,7 @@ class UserForceArrays:
         blocks = np.concatenate([*blocks, *(host.shells[shell].nodes[nodes] for shell, nodes in force.shells)])
         self.rows = np.sort(np.unique(blocks, return_index=True)[1])
         self.blocks = blocks[self.rows]
-        self.places = wp.array(self.blocks.astype(np.int32), dtype=int, device=device)
+        self.nodes = wp.array(self.blocks.astype(np.int32), dtype=int, device=device)
         self.values, shape = {}, (worlds, len(self.rows))
         for (name, size), values in zip(self.layout, force.parameters.values(), strict=True):
             single = values if values.ndim < 1 + (size == 3) else values[self.rows]
@@ -45,12 +45,10 @@ class UserForceArrays:
 
     def columns(self, name: str) -> slice:
         """Return the components of a parameter in `numbers`."""
-        first = 0
-        for other, size in self.layout:
-            if other == name:
-                return slice(first, first + size)
-            first += size
-        raise KeyError(name)
+        names, sizes = zip(*self.layout, strict=True)
+        index = names.index(name)
+        first = sum(sizes[:index])
+        return slice(first, first + sizes[index])
 
     def set(self, name: str, values) -> None:
         """Replace a parameter in place, which captured graphs read: one value, one a world, one a node, or one each.
@@ -75,6 +73,17 @@ class UserForceArrays:
         stored[:] = values
         self.version += 1
         self._upload()
+
+    def energy(self, q: wp.array, time: float, blocks: int) -> np.ndarray:
+        """Return the potential energy at dof blocks q of `blocks` a world (worlds,) [J]."""
+        pairs, shape = self.force.pairs, self.parameters.shape
+        kernel, out = (
+            energy_kernel(self.force.potential, self.layout, pairs, self._real),
+            wp.zeros(shape, dtype=self._real, device=q.device),
+        )
+        inputs = [self.nodes, self.parameters, q, time, blocks]
+        wp.launch(kernel, shape, inputs, [out], device=q.device)
+        return out.numpy().astype(float).sum(1)
 
     def _upload(self) -> None:
         numbers = [values.reshape(*values.shape[:2], -1) for values in self.values.values()]

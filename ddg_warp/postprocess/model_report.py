@@ -130,10 +130,20 @@ def coupled_lines(model) -> list[str]:
         measure, density = part.term.measure.name, part.term.density.name
         lines.append(f"  {part.term.name}: {part.elements * model.worlds} elements, {measure} x {density}")
     lines += [f"  {name} on {values.shape[1]} edges of rods, implicit" for name, values in host.coefficients.items()]
+    for force in coupled.user_forces:
+        kind = "all pairs of " if force.force.pairs else ""
+        lines.append(
+            f"  {force.name}: user-defined force on {kind}{len(force.blocks)} nodes, by {', '.join(force.values)}"
+        )
+    paired = any(force.force.pairs for force in coupled.user_forces)
     reals, solver, bands, mixed_axial = 9 * table.positions, f"PCG ({name})", "", False
     if substructuring and substructuring.banded:
         substructuring.plan.bind(host, table.rows.numpy(), table.columns.numpy(), substructuring.kept)
-        solver = "substructuring, exact" if substructuring.plan.complete and not host.contact_parameters else solver
+        solver = (
+            "substructuring, exact"
+            if substructuring.plan.complete and not (host.contact_parameters or paired)
+            else solver
+        )
         mixed_axial = substructuring.allows_mixed_axial
         places, block = int(substructuring.plan.count.sum()), substructuring.plan.block
         reals += 3 * block**2 * substructuring.plan.path.size

@@ -22,7 +22,7 @@ TWIST = 2  # index of the twist among the strains of rod vertices and of half ce
 def energies(model, state) -> dict:
     """Return elastic energies by term, kinetic and gravitational energy [J]; arrays (worlds,) of several worlds.
 
-    The potential of gravity is zero at the origin.
+    The potential of gravity is zero at the origin. User-defined forces with a potential have energies by name.
     """
     _check("energies", model, state)
     tangent = Tangent(model)
@@ -31,6 +31,9 @@ def energies(model, state) -> dict:
         q, v = (values.reshape(model.worlds, -1) for values in (part.back(part.dofs(state)), part.rates(state)))
         kinetic += 0.5 * (part.mass.reshape(v.shape) * v * v).sum(1)
         potential -= (q * part.weight()).sum(1)
+    for force in model.coupled.user_forces if model.coupled is not None else ():
+        if force.force.potential:
+            result[force.name] = force.energy(state.coupled.q, state.time, model.coupled.blocks)
     every = result | {"kinetic": kinetic, "gravity": potential}
     return {name: values if model.worlds > 1 else float(values[0]) for name, values in every.items()}
 

@@ -52,17 +52,17 @@ class UserForces:
     def add_nodal_force(self, name: str, function: Callable, **options) -> None:
         """Add a user-defined force on nodes, evaluated with its derivatives in every iteration of steps and equilibria.
 
-        The force of a node is `function(real)(x, v, t, p)`, a Warp function in the scalar type `real`: x is the position [m], v the
-        velocity in the step [m/s], zero in equilibria, t the time or the load parameter, and p has the parameters by name. Its
-        derivatives come from automatic differentiation. Rods on which it acts belong to the coupled system.
+        The force of a node is `function(real)(x, v, t, p)`, a Warp function in the scalar type `real`. Here x is the position [m],
+        v the velocity in the step [m/s], zero in equilibria, and t the time or the load parameter. Parameters are attributes of p.
+        Derivatives come from automatic differentiation. Rods on which it acts belong to the coupled system.
 
         Args:
             name: name in parameters and reports; parameters are `name.parameter`.
             function: real -> Warp function with annotated arguments, vectors `wp.types.vector(3, real)`, and `p: typing.Any`.
             options: `parameters`, values by name: a number, (nodes,), a vector (3,) or (nodes, 3). `potential`, real -> Warp function
                 of the same arguments whose negative derivative by x is the force [J]; equilibria need one. `rods` with `nodes` of
-                each, and `shells` with `vertices`: where it acts, by default on all nodes of all rods and shells added so far. A node
-                that several rods share counts once.
+                each, and `shells` with `vertices`: where it acts, by default on all nodes of all rods and shells added so far. A joint
+                counts once.
 
         Raises:
             SceneError: a wrong argument, or a function of other arguments; the message names it.
@@ -72,10 +72,10 @@ class UserForces:
     def add_pair_force(self, name: str, function: Callable, **options) -> None:
         """Add a user-defined force between all pairs of nodes, such as gravity or electrostatics.
 
-        The force on a node from another is `function(real)(d, p, q)`, a Warp function in the scalar type `real`: d is the vector to the
-        other node [m], p and q have the parameters of both nodes by name. It is opposite for the other node, and its derivative by d
-        is symmetric, as for forces with a potential of the distance. Its cost grows with the square of the number of nodes. The
-        `potential` is that of a pair. Other arguments as in `add_nodal_force`.
+        The force on a node from another is `function(real)(d, p, q)`, a Warp function in the scalar type `real`. Here d is the vector
+        to the other node [m]; parameters of both nodes are attributes of p and q. The force on the other node must be opposite, and
+        the derivative by d symmetric, as for forces with a potential of the distance. The cost of an evaluation grows with the square
+        of the number of nodes. `potential` is the energy of a pair. Other arguments as in `add_nodal_force`.
         """
         self._add_user_force("add_pair_force", name, function, True, **options)
 
@@ -106,7 +106,9 @@ class UserForces:
         shells = (
             range(len(self.shells))
             if everything
-            else argument_checks.indices("shells", [] if shells is None else shells)
+            else []
+            if shells is None
+            else argument_checks.indices("shells", shells)
         )
         places = []
         for rod in argument_checks.once(f"{call}: rods", np.asarray(rods, int)).tolist():
@@ -145,7 +147,7 @@ def parameter(label: str, values, count: int) -> np.ndarray:
 
 
 def _check_function(label: str, factory, arguments: tuple[str, ...]) -> None:
-    """Refuse what is no factory of a Warp function with these arguments."""
+    """Refuse a factory without a Warp function of the arguments."""
     import warp as wp
 
     if isinstance(factory, wp.Function) or not callable(factory):

@@ -145,6 +145,8 @@ def without_gradient(engine) -> str:
         "gyroscopic couples": engine.integrator.gyroscopic,
         "shell normals that a grip turns": model.coupled is not None
         and any(model.motions[i] in model.grips for part in model.coupled.sets for i in part.turning[:, 2]),
+        "user-defined forces on supports": model.coupled is not None
+        and any(np.isin(force.blocks, fixed[-1]).any() for force in model.coupled.user_forces),
         "follower loads on supports": any(
             np.isin(load.places, places).any()
             for part, places in zip(parts, fixed, strict=True)

@@ -20,6 +20,7 @@ from ddg_warp.kernels.core.islands import (
     STEP_PROGRESS,
     SUBSTEP_FRACTION,
 )
+from ddg_warp.kernels.core.launch import CPU_OPTIONS
 
 
 @cache
@@ -58,13 +59,13 @@ def start_kernels(real):
     """
     V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def clock(scalars: wp.array2d(dtype=real), times: wp.array2d(dtype=real), time: wp.array(dtype=real)):
         w = wp.tid()
-        part = wp.min(scalars[STEP_PROGRESS, w] + scalars[SUBSTEP_FRACTION, w], real(1.0))
-        time[w] = times[0, w] + part * (times[1, w] - times[0, w])
+        fraction = wp.min(scalars[STEP_PROGRESS, w] + scalars[SUBSTEP_FRACTION, w], real(1.0))
+        time[w] = times[0, w] + fraction * (times[1, w] - times[0, w])
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def begin(
         contact: wp.array(dtype=V),
         pressed: wp.array(dtype=real),
@@ -88,13 +89,13 @@ def start_kernels(real):
             total[i] = V()
             bound[i] = largest
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def clear(flags: wp.array2d(dtype=int), blocks: int, stiffness: wp.array(dtype=M)):
         i = wp.tid()
         if flags[NEEDS_DIRECTION, i / blocks] != 0:
             stiffness[i] = M()
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def unsymmetric(stiffness: wp.array(dtype=M), tolerance: real, blocks: int, failed: wp.array(dtype=int)):
         i = wp.tid()
         s = stiffness[i]
@@ -110,11 +111,12 @@ def finish_kernels(real, quadratic: bool):
     """Build the kernels that end evaluations.
 
     `work`: add the mean work of the forces along the step to the change of the energy.
-    `inertia`: add the stiffness to the inertia of blocks, which matrices take; where it was indefinite, its positive part.
+    `inertia`: add the stiffness to the inertia of blocks, which matrices take; where the matrix was indefinite, its projection to
+    positive semidefinite blocks.
     """
     V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def work(
         q: wp.array(dtype=V),
         base: wp.array(dtype=V),
@@ -132,7 +134,7 @@ def finish_kernels(real, quadratic: bool):
             change[w, k] = change[w, k] - made
             rounding_error[w, k] = rounding_error[w, k] + wp.abs(made)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def inertia(
         mass: mass_type(real, quadratic),
         stiffness: wp.array(dtype=M),
@@ -176,9 +178,9 @@ def nodal_kernels(function, layout: tuple[tuple[str, int], ...], real):
 
     derivative = wp.grad(along)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def evaluate(
-        places: wp.array(dtype=int),
+        nodes: wp.array(dtype=int),
         parameters: wp.array2d(dtype=struct),
         q: wp.array(dtype=V),
         start: wp.array(dtype=V),
@@ -192,15 +194,15 @@ def nodal_kernels(function, layout: tuple[tuple[str, int], ...], real):
         w, k = wp.tid()
         if flags[STATUS, w] != 0:
             return
-        i = places[k] + w * blocks
+        i = nodes[k] + w * blocks
         f = force(q[i], (q[i] - start[i]) * scalars[INVERSE_STEP, w], time[w], parameters[w, k])
         half = 1 - flags[ENERGY_BUFFER, w]
         out[half, i] = out[half, i] + f
         total[i] = total[i] + f
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def stiffen(
-        places: wp.array(dtype=int),
+        nodes: wp.array(dtype=int),
         parameters: wp.array2d(dtype=struct),
         q: wp.array(dtype=V),
         start: wp.array(dtype=V),
@@ -213,7 +215,7 @@ def nodal_kernels(function, layout: tuple[tuple[str, int], ...], real):
         w, k = wp.tid()
         if flags[NEEDS_DIRECTION, w] == 0:
             return
-        i = places[k] + w * blocks
+        i = nodes[k] + w * blocks
         rate = scalars[INVERSE_STEP, w]
         s = M()
         for d in range(3):
@@ -225,9 +227,9 @@ def nodal_kernels(function, layout: tuple[tuple[str, int], ...], real):
                 s[d, c] = -row[c]
         out[i] = out[i] + s
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pull(
-        places: wp.array(dtype=int),
+        nodes: wp.array(dtype=int),
         parameters: wp.array2d(dtype=struct),
         q: wp.array(dtype=V),
         start: wp.array(dtype=V),
@@ -241,7 +243,7 @@ def nodal_kernels(function, layout: tuple[tuple[str, int], ...], real):
         by_parameters: wp.array2d(dtype=P),
     ):
         world, k = wp.tid()
-        i = places[k] + world * blocks
+        i = nodes[k] + world * blocks
         change = q[i] - start[i]
         rate = rates[world]
         by_x, by_v, _t, by_p, _w = derivative(q[i], change * rate, time[world], parameters[world, k], w[i])
@@ -272,9 +274,9 @@ def pair_kernels(function, layout: tuple[tuple[str, int], ...], real, linear):
 
     derivative = wp.grad(along)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def evaluate(
-        places: wp.array(dtype=int),
+        nodes: wp.array(dtype=int),
         parameters: wp.array2d(dtype=struct),
         q: wp.array(dtype=V),
         start: wp.array(dtype=V),
@@ -288,19 +290,19 @@ def pair_kernels(function, layout: tuple[tuple[str, int], ...], real, linear):
         w, k = wp.tid()
         if flags[STATUS, w] != 0:
             return
-        i = places[k] + w * blocks
+        i = nodes[k] + w * blocks
         p = parameters[w, k]
         f = V()
-        for other in range(places.shape[0]):
-            if other != k:
-                f += force(q[places[other] + w * blocks] - q[i], p, parameters[w, other])
+        for neighbour in range(nodes.shape[0]):
+            if neighbour != k:
+                f += force(q[nodes[neighbour] + w * blocks] - q[i], p, parameters[w, neighbour])
         half = 1 - flags[ENERGY_BUFFER, w]
         out[half, i] = out[half, i] + f
         total[i] = total[i] + f
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def stiffen(
-        places: wp.array(dtype=int),
+        nodes: wp.array(dtype=int),
         parameters: wp.array2d(dtype=struct),
         q: wp.array(dtype=V),
         start: wp.array(dtype=V),
@@ -313,23 +315,23 @@ def pair_kernels(function, layout: tuple[tuple[str, int], ...], real, linear):
         w, k = wp.tid()
         if flags[NEEDS_DIRECTION, w] == 0 or flags[DROP_COMPRESSION, w] != 0:
             return
-        i = places[k] + w * blocks
+        i = nodes[k] + w * blocks
         p = parameters[w, k]
         s = M()
-        for other in range(places.shape[0]):
-            if other != k:
-                d = q[places[other] + w * blocks] - q[i]
+        for neighbour in range(nodes.shape[0]):
+            if neighbour != k:
+                d = q[nodes[neighbour] + w * blocks] - q[i]
                 for row in range(3):
                     unit = V()
                     unit[row] = real(1.0)
-                    by_d, _p, _q, _w = derivative(d, p, parameters[w, other], unit)
+                    by_d, _p, _q, _w = derivative(d, p, parameters[w, neighbour], unit)
                     for c in range(3):
                         s[row, c] = s[row, c] + by_d[c]
         out[i] = out[i] + s
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def multiply(
-        places: wp.array(dtype=int),
+        nodes: wp.array(dtype=int),
         parameters: wp.array2d(dtype=struct),
         q: wp.array(dtype=V),
         flags: wp.array2d(dtype=int),
@@ -343,14 +345,14 @@ def pair_kernels(function, layout: tuple[tuple[str, int], ...], real, linear):
         w, k = wp.tid()
         if wanted[w] != 1 or flags[DROP_COMPRESSION, w] != 0:
             return
-        i = places[k] + w * blocks
+        i = nodes[k] + w * blocks
         p = parameters[w, k]
         y = V()
-        for other in range(places.shape[0]):
-            if other != k:
-                j = places[other] + w * blocks
+        for neighbour in range(nodes.shape[0]):
+            if neighbour != k:
+                j = nodes[neighbour] + w * blocks
                 vj = V(real(v[j][0]), real(v[j][1]), real(v[j][2]))
-                by_d, _p, _q, _w = derivative(q[j] - q[i], p, parameters[w, other], vj)
+                by_d, _p, _q, _w = derivative(q[j] - q[i], p, parameters[w, neighbour], vj)
                 y += by_d
         mask = int(inactive[i])
         total = out[i]
@@ -358,31 +360,31 @@ def pair_kernels(function, layout: tuple[tuple[str, int], ...], real, linear):
             if ((mask >> d) & 1) == 0:
                 total[d] = total[d] - linear(y[d])
         out[i] = total
-        dots[w, places[k]] = wp.dot(v[i], total)
+        dots[w, nodes[k]] = wp.dot(v[i], total)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def blocks_of(
-        places: wp.array(dtype=int),
+        nodes: wp.array(dtype=int),
         parameters: wp.array2d(dtype=struct),
         q: wp.array(dtype=V),
         blocks: int,
         out: wp.array3d(dtype=M),
     ):
-        w, k, other = wp.tid()
+        w, k, neighbour = wp.tid()
         s = M()
-        if other != k:
-            d = q[places[other] + w * blocks] - q[places[k] + w * blocks]
+        if neighbour != k:
+            d = q[nodes[neighbour] + w * blocks] - q[nodes[k] + w * blocks]
             for row in range(3):
                 unit = V()
                 unit[row] = real(1.0)
-                by_d, _p, _q, _w = derivative(d, parameters[w, k], parameters[w, other], unit)
+                by_d, _p, _q, _w = derivative(d, parameters[w, k], parameters[w, neighbour], unit)
                 for c in range(3):
                     s[row, c] = -by_d[c]
-        out[w, k, other] = s
+        out[w, k, neighbour] = s
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pull(
-        places: wp.array(dtype=int),
+        nodes: wp.array(dtype=int),
         parameters: wp.array2d(dtype=struct),
         q: wp.array(dtype=V),
         start: wp.array(dtype=V),
@@ -396,19 +398,48 @@ def pair_kernels(function, layout: tuple[tuple[str, int], ...], real, linear):
         by_parameters: wp.array2d(dtype=P),
     ):
         world, k = wp.tid()
-        i = places[k] + world * blocks
+        i = nodes[k] + world * blocks
         p = parameters[world, k]
         by_x = V()
         by_p = P()
-        for other in range(places.shape[0]):
-            if other != k:
-                j = places[other] + world * blocks
+        for neighbour in range(nodes.shape[0]):
+            if neighbour != k:
+                j = nodes[neighbour] + world * blocks
                 d = q[j] - q[i]
-                by_d, first, _q, _w = derivative(d, p, parameters[world, other], w[i])
-                back, _p, second, _v = derivative(-d, parameters[world, other], p, w[j])
+                by_d, first, _q, _w = derivative(d, p, parameters[world, neighbour], w[i])
+                back, _p, second, _v = derivative(-d, parameters[world, neighbour], p, w[j])
                 by_x += back - by_d
                 by_p += numbers(first) + numbers(second)
         by_q[i] = by_q[i] + by_x
         by_parameters[world, k] = by_p
 
     return evaluate, stiffen, multiply, blocks_of, pull
+
+
+@cache
+def energy_kernel(potential, layout: tuple[tuple[str, int], ...], pairs: bool, real):
+    """Build the kernel `energy`: write the energy of every node, of pairs half of theirs."""
+    V, struct, function = wp.types.vector(3, real), parameter_struct(layout, real), potential(real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def energy(
+        nodes: wp.array(dtype=int),
+        parameters: wp.array2d(dtype=struct),
+        q: wp.array(dtype=V),
+        time: real,
+        blocks: int,
+        out: wp.array2d(dtype=real),
+    ):
+        w, k = wp.tid()
+        x = q[nodes[k] + w * blocks]
+        p = parameters[w, k]
+        if wp.static(pairs):
+            total = real(0.0)
+            for neighbour in range(nodes.shape[0]):
+                if neighbour != k:
+                    total += function(q[nodes[neighbour] + w * blocks] - x, p, parameters[w, neighbour])
+            out[w, k] = real(0.5) * total
+        else:
+            out[w, k] = function(x, V(), time, p)
+
+    return energy

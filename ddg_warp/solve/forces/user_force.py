@@ -2,7 +2,7 @@
 
 The force acts at every iterate, with its stiffness in the matrix. Blocks of nodes are added to their inertia; blocks between nodes act
 matrix-free, in the products of conjugate gradients. The line search takes the mean work of the forces along a step, which is exact for
-linear forces and needs no potential. Where the matrix is indefinite, it takes the positive part of the blocks of nodes, and leaves out
+linear forces and needs no potential. Where the matrix is indefinite, it takes the positive semidefinite blocks of nodes, and leaves out
 forces between pairs.
 """
 
@@ -65,8 +65,8 @@ class UserForces(Force):
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [self._clock, self._begin, self._clear, self._unsymmetric, self._work, self._inertia]
-        return [*own, *(kernel for kernels in self._kernels for kernel in kernels[:-1])]
+        common = [self._clock, self._begin, self._clear, self._unsymmetric, self._work, self._inertia]
+        return [*common, *(kernel for kernels in self._kernels for kernel in kernels[:-1])]
 
     def upload(self, t0: float, t1: float) -> None:
         """Upload the times of a step."""
@@ -95,11 +95,11 @@ class UserForces(Force):
 
     @timer("user forces")
     def evaluate(self, q: wp.array, islands) -> None:
-        """Evaluate the forces at positions q, with those of contact in `total`."""
+        """Evaluate the forces at positions q; `total` includes contact forces."""
         read = [*self._contact, self.stiffness, islands.arrays[0], self.coupled.blocks]
         self._launch(self._begin, len(q), read, [self._force, self.total, self.bound])
         for part, kernels in zip(self.parts, self._kernels, strict=True):
-            read = [part.places, part.parameters, q, self.start, self.time, *islands.arrays, self.coupled.blocks]
+            read = [part.nodes, part.parameters, q, self.start, self.time, *islands.arrays, self.coupled.blocks]
             self._launch(kernels[0], part.parameters.shape, read, [self._force, self.total])
 
     def account(self, iterates, norms, islands) -> None:
@@ -119,7 +119,7 @@ class UserForces(Force):
         self._q, self._flags = q, islands.arrays[0]
         self._launch(self._clear, len(q), [self._flags, self.coupled.blocks], [self.stiffness])
         for part, kernels in zip(self.parts, self._kernels, strict=True):
-            read = [part.places, part.parameters, q, self.start, self.time, *islands.arrays, self.coupled.blocks]
+            read = [part.nodes, part.parameters, q, self.start, self.time, *islands.arrays, self.coupled.blocks]
             self._launch(kernels[1], part.parameters.shape, read, [self.stiffness])
 
     @timer("user forces")
@@ -127,7 +127,7 @@ class UserForces(Force):
         """Add the products of the blocks between nodes to `product`, and write p . H p of these nodes."""
         for part, kernels in zip(self.parts, self._kernels, strict=True):
             if part.force.pairs:
-                read = [part.places, part.parameters, self._q, self._flags, system.masks.inactive, system.wanted]
+                read = [part.nodes, part.parameters, self._q, self._flags, system.masks.inactive, system.wanted]
                 read += [p, self.coupled.blocks]
                 self._launch(kernels[2], part.parameters.shape, read, [product, system.dots])
 
@@ -148,12 +148,12 @@ class UserForces(Force):
             count = len(part.blocks)
             if part.force.pairs and count > MOST_PAIRED:
                 raise SceneError(
-                    f"{part.name}: a matrix of pairs of {count} nodes is too large, {MOST_PAIRED} at most; take solver='pcg' for equilibria, "
-                    "and fewer nodes for their stability and gradients"
+                    f"{part.name}: a matrix of pairs of {count} nodes is too large, {MOST_PAIRED} at most; take solver='pcg' for "
+                    "equilibria, and fewer nodes for their stability and gradients"
                 )
             if part.force.pairs:
                 blocks = wp.zeros((coupled.worlds, count, count), dtype=self.stiffness.dtype, device=coupled.device)
-                read = [part.places, part.parameters, self._q, coupled.blocks]
+                read = [part.nodes, part.parameters, self._q, coupled.blocks]
                 self._launch(kernels[3], blocks.shape, read, [blocks])
                 places = 3 * (coupled.blocks * np.arange(coupled.worlds)[:, None] + part.blocks)
                 dofs = places[..., None] + np.arange(3)

@@ -366,9 +366,8 @@ class CoupledReactions(_Reactions):
     def follow(self, step) -> None:
         """Allocate the arrays for a `CoupledStep`, before a capture."""
         newton, host = step.newton, self.part.host
-        self._react = support_forces.coupled_reaction_kernel(
-            self._real, newton.linear, host.quadratic, newton.contact is not None
-        )
+        outer = newton.contact is not None or newton.user_forces is not None
+        self._react = support_forces.coupled_reaction_kernel(self._real, newton.linear, host.quadratic, outer)
         device_arrays.load_kernels([self._react], self._device)
         if self._obstacles:
             self._obstacles.follow(newton.contact.terms)
