@@ -27,6 +27,7 @@ SMALL = {
     "flag_on_pole": {"cells": 12},
     "flagellum": {"n": 25, "steps": 50},
     "flying_beam": {"n": 20},
+    "charged_loop": {},
     "greenhill": {"n": 100},
     "growing_strip": {},
     "gridshell_dome": {"rods": 3},

@@ -150,12 +150,12 @@ def test_pair_forces_are_the_sum_over_pairs_and_conserve_momentum(device, kind):
 
 
 def ring(n: int, strength: float) -> ddg.Scene:
-    """Return a closed row of springs of EA 1 N and radius 1 m, with repelling charges 1 / n at nodes."""
+    """Return a closed rod of EA 1 N and radius 1 m, with repelling charges 1 / n at nodes; equal angles bend no node radially."""
     scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
     angle = 2.0 * np.pi * np.arange(n) / n
     points = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], -1)
-    section = ddg.Stiffness(EA=1.0, EI1=1.0, mass_per_length=1.0)
-    scene.add_rod(points, section=section, closed=True, bend=False)
+    section = ddg.Stiffness(EA=1.0, EI1=0.01, mass_per_length=1.0)
+    scene.add_rod(points, section=section, closed=True, twist=False, natural="straight", curvature="angle")
     scene.fix(0, [0])
     scene.fix(0, [n // 2], "yz")
     scene.fix(0, [n // 4], "z")

@@ -190,6 +190,7 @@ def nodal_kernels(function, layout: tuple[tuple[str, int], ...], real):
         blocks: int,
         out: wp.array2d(dtype=V),
         total: wp.array(dtype=V),
+        bound: wp.array(dtype=real),
     ):
         w, k = wp.tid()
         if flags[STATUS, w] != 0:
@@ -259,9 +260,9 @@ def nodal_kernels(function, layout: tuple[tuple[str, int], ...], real):
 def pair_kernels(function, layout: tuple[tuple[str, int], ...], real, linear):
     """Build the kernels of a pair force; one thread sums over all other nodes, in order.
 
-    `evaluate`, `stiffen`: as for a nodal force, with the diagonal blocks of the stiffness.
-    `multiply`: subtract the products of the other blocks with a vector.
-    `blocks_of`: write the other blocks.
+    `evaluate`: as for a nodal force, with a bound of the stiffness, twice the force of a pair over its distance.
+    `multiply`: subtract the change of the force by a vector of displacements.
+    `blocks_of`: write the blocks of the stiffness between different nodes.
     `pull`: its reverse.
     """
     V, M, H = wp.types.vector(3, real), wp.types.matrix((3, 3), real), wp.types.vector(3, linear)
@@ -286,6 +287,7 @@ def pair_kernels(function, layout: tuple[tuple[str, int], ...], real, linear):
         blocks: int,
         out: wp.array2d(dtype=V),
         total: wp.array(dtype=V),
+        bound: wp.array(dtype=real),
     ):
         w, k = wp.tid()
         if flags[STATUS, w] != 0:
@@ -293,41 +295,17 @@ def pair_kernels(function, layout: tuple[tuple[str, int], ...], real, linear):
         i = nodes[k] + w * blocks
         p = parameters[w, k]
         f = V()
-        for neighbour in range(nodes.shape[0]):
-            if neighbour != k:
-                f += force(q[nodes[neighbour] + w * blocks] - q[i], p, parameters[w, neighbour])
-        half = 1 - flags[ENERGY_BUFFER, w]
-        out[half, i] = out[half, i] + f
-        total[i] = total[i] + f
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def stiffen(
-        nodes: wp.array(dtype=int),
-        parameters: wp.array2d(dtype=struct),
-        q: wp.array(dtype=V),
-        start: wp.array(dtype=V),
-        time: wp.array(dtype=real),
-        flags: wp.array2d(dtype=int),
-        scalars: wp.array2d(dtype=real),
-        blocks: int,
-        out: wp.array(dtype=M),
-    ):
-        w, k = wp.tid()
-        if flags[NEEDS_DIRECTION, w] == 0 or flags[DROP_COMPRESSION, w] != 0:
-            return
-        i = nodes[k] + w * blocks
-        p = parameters[w, k]
-        s = M()
+        stiffness = real(0.0)
         for neighbour in range(nodes.shape[0]):
             if neighbour != k:
                 d = q[nodes[neighbour] + w * blocks] - q[i]
-                for row in range(3):
-                    unit = V()
-                    unit[row] = real(1.0)
-                    by_d, _p, _q, _w = derivative(d, p, parameters[w, neighbour], unit)
-                    for c in range(3):
-                        s[row, c] = s[row, c] + by_d[c]
-        out[i] = out[i] + s
+                pair = force(d, p, parameters[w, neighbour])
+                f += pair
+                stiffness += wp.length(pair) / wp.length(d)
+        half = 1 - flags[ENERGY_BUFFER, w]
+        out[half, i] = out[half, i] + f
+        total[i] = total[i] + f
+        bound[i] = bound[i] + real(2.0) * stiffness
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def multiply(
@@ -351,8 +329,9 @@ def pair_kernels(function, layout: tuple[tuple[str, int], ...], real, linear):
         for neighbour in range(nodes.shape[0]):
             if neighbour != k:
                 j = nodes[neighbour] + w * blocks
-                vj = V(real(v[j][0]), real(v[j][1]), real(v[j][2]))
-                by_d, _p, _q, _w = derivative(q[j] - q[i], p, parameters[w, neighbour], vj)
+                u = v[j] - v[i]
+                change = V(real(u[0]), real(u[1]), real(u[2]))
+                by_d, _p, _q, _w = derivative(q[j] - q[i], p, parameters[w, neighbour], change)
                 y += by_d
         mask = int(inactive[i])
         total = out[i]
@@ -413,7 +392,7 @@ def pair_kernels(function, layout: tuple[tuple[str, int], ...], real, linear):
         by_q[i] = by_q[i] + by_x
         by_parameters[world, k] = by_p
 
-    return evaluate, stiffen, multiply, blocks_of, pull
+    return evaluate, multiply, blocks_of, pull
 
 
 @cache

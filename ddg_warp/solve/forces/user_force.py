@@ -1,9 +1,9 @@
 """User-defined forces in Newton's method on the coupled system; see `kernels.forces.user_force`.
 
-The force acts at every iterate, with its stiffness in the matrix. Blocks of nodes are added to their inertia; blocks between nodes act
-matrix-free, in the products of conjugate gradients. The line search takes the mean work of the forces along a step, which is exact for
-linear forces and needs no potential. Where the matrix is indefinite, it takes the positive semidefinite blocks of nodes, and leaves out
-forces between pairs.
+The force acts at every iterate, with its stiffness in the matrix. Blocks of nodal forces are added to the inertia of nodes. Pair
+forces act matrix-free, in the products of conjugate gradients: preconditioners do without, since their diagonal blocks alone may be
+indefinite. The line search takes the mean work of the forces along a step, which is exact for linear forces and needs no potential.
+Where the matrix is indefinite, it takes the positive semidefinite projection of nodal blocks, and no pair forces.
 """
 
 import numpy as np
@@ -100,7 +100,7 @@ class UserForces(Force):
         self._launch(self._begin, len(q), read, [self._force, self.total, self.bound])
         for part, kernels in zip(self.parts, self._kernels, strict=True):
             read = [part.nodes, part.parameters, q, self.start, self.time, *islands.arrays, self.coupled.blocks]
-            self._launch(kernels[0], part.parameters.shape, read, [self._force, self.total])
+            self._launch(kernels[0], part.parameters.shape, read, [self._force, self.total, self.bound])
 
     def account(self, iterates, norms, islands) -> None:
         """Add the mean work of the forces along the step to the change of the energy."""
@@ -115,21 +115,22 @@ class UserForces(Force):
         self._launch(self._inertia, len(q), read, [self.inertia])
 
     def linearise(self, q: wp.array, islands) -> None:
-        """Write `stiffness` at positions q, for which `multiply` acts from now on."""
+        """Write `stiffness` of forces on nodes at positions q, where `multiply` acts from now on."""
         self._q, self._flags = q, islands.arrays[0]
         self._launch(self._clear, len(q), [self._flags, self.coupled.blocks], [self.stiffness])
         for part, kernels in zip(self.parts, self._kernels, strict=True):
-            read = [part.nodes, part.parameters, q, self.start, self.time, *islands.arrays, self.coupled.blocks]
-            self._launch(kernels[1], part.parameters.shape, read, [self.stiffness])
+            if not part.force.pairs:
+                read = [part.nodes, part.parameters, q, self.start, self.time, *islands.arrays, self.coupled.blocks]
+                self._launch(kernels[1], part.parameters.shape, read, [self.stiffness])
 
     @timer("user forces")
     def multiply(self, p: wp.array, product: wp.array, system) -> None:
-        """Add the products of the blocks between nodes to `product`, and write p . H p of these nodes."""
+        """Add the products of pair forces to `product`, and write p . H p of their nodes."""
         for part, kernels in zip(self.parts, self._kernels, strict=True):
             if part.force.pairs:
                 read = [part.nodes, part.parameters, self._q, self._flags, system.masks.inactive, system.wanted]
                 read += [p, self.coupled.blocks]
-                self._launch(kernels[2], part.parameters.shape, read, [product, system.dots])
+                self._launch(kernels[1], part.parameters.shape, read, [product, system.dots])
 
     def refuse_unsymmetric(self, failed: wp.array) -> None:
         """Mark worlds with an unsymmetric stiffness, which conjugate gradients do not solve (worlds,)."""
@@ -154,11 +155,13 @@ class UserForces(Force):
             if part.force.pairs:
                 blocks = wp.zeros((coupled.worlds, count, count), dtype=self.stiffness.dtype, device=coupled.device)
                 read = [part.nodes, part.parameters, self._q, coupled.blocks]
-                self._launch(kernels[3], blocks.shape, read, [blocks])
+                self._launch(kernels[2], blocks.shape, read, [blocks])
                 places = 3 * (coupled.blocks * np.arange(coupled.worlds)[:, None] + part.blocks)
                 dofs = places[..., None] + np.arange(3)
                 rows, columns = np.broadcast_arrays(dofs[:, :, None, :, None], dofs[:, None, :, None, :])
-                entries = blocks.numpy().astype(float).ravel(), (rows.ravel(), columns.ravel())
+                values, each = blocks.numpy().astype(float), np.arange(count)
+                values[:, each, each] = -values.sum(2)
+                entries = values.ravel(), (rows.ravel(), columns.ravel())
                 result = result + sparse.csc_matrix(entries, shape=(size, size))
         return result
 
