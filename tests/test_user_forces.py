@@ -238,6 +238,30 @@ def test_changed_parameters_act_from_the_next_step(device):
     assert "net/tether/stiffness" in changed.parameters()
 
 
+def test_substeps_take_their_own_time(device):
+    model = both_forces(rod_scene()).build(device, "float64")
+    halved, state = ddg.Integrator(model, rtol=1e-11), model.state()
+    halved._coupled.islands.substep.fill_(0.5)
+    whole = ddg.Integrator(model, rtol=1e-11)
+    two = whole.step(whole.step(state, 0.5 * DT), 0.5 * DT)
+    np.testing.assert_allclose(halved.step(state, DT).points(), two.points(), atol=1e-12)
+
+
+def test_attracted_rods_meet_in_contact_and_conserve_momentum(device):
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), mass_damping=5.0)
+    scene.add_rod(LINE, section=ddg.Circle(0.02), material=ddg.Material(1e6, density=1e3), name="first")
+    turned = (LINE - LINE.mean(axis=0))[:, [1, 0, 2]] + LINE.mean(axis=0) + [0.01, 0.02, 0.1]
+    scene.add_rod(turned, section=ddg.Circle(0.02), material=ddg.Material(1e6, density=1e3), name="second")
+    scene.contact(friction=0.0)
+    scene.add_pair_force("attraction", attraction, parameters={"mass": 0.1, "strength": 0.5})
+    model = scene.build(device, "float64")
+    state = stepped(model, 40, rtol=1e-8)
+    weights = np.sum(point_masses(model), axis=0)[:, None]
+    assert 0.02 < state.points()[9:, 2].mean() - state.points()[:9, 2].mean() < 0.06
+    momentum = weights * state.velocities()
+    assert np.abs(momentum.sum(0)).max() < 1e-7 * max(np.abs(momentum).sum(), 1e-3)
+
+
 @pytest.mark.parametrize("kind", SCENES)
 def test_gradients_agree_with_differences(device, kind):
     torch = pytest.importorskip("torch")
