@@ -15,11 +15,10 @@ class UserForceArrays:
         blocks, nodes: dof blocks (n,) on which it acts, on the host and the device. A joint counts once.
         parameters: values of each node in each world, a struct (worlds, n).
         layout: name and number of components of each parameter.
-        version: counter of changes.
     """
 
     def __init__(self, force, host, worlds: int, device, real):
-        self.force, self.name, self.layout, self.worlds, self.version = force, force.name, force.layout, worlds, 0
+        self.force, self.name, self.layout, self.worlds = force, force.name, force.layout, worlds
         rods = {rod.rod: rod.nodes for rod in host.rods}
         blocks = [rods[rod][nodes] for rod, nodes in force.rods]
         blocks = np.concatenate([*blocks, *(host.shells[shell].nodes[nodes] for shell, nodes in force.shells)])
@@ -71,7 +70,6 @@ class UserForceArrays:
         if not np.isfinite(values).all():
             raise ValueError(f"{self.name}.{name} is not finite")
         stored[:] = values
-        self.version += 1
         self._upload()
 
     def energy(self, q: wp.array, time: float, blocks: int) -> np.ndarray:

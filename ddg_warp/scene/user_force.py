@@ -60,7 +60,7 @@ class UserForces:
             name: name in parameters and reports; parameters are `name.parameter`.
             function: real -> Warp function with annotated arguments, vectors `wp.types.vector(3, real)`, and `p: typing.Any`.
             options: `parameters`, values by name: a number, (nodes,), a vector (3,) or (nodes, 3). `potential`, real -> Warp function
-                of the same arguments whose negative derivative by x is the force [J]; equilibria need one. `rods` with `nodes` of
+                of the same arguments whose negative derivative by x is the force [J], for `Model.energies`. `rods` with `nodes` of
                 each, and `shells` with `vertices`: where it acts, by default on all nodes of all rods and shells added so far. A joint
                 counts once.
 
