@@ -296,7 +296,7 @@ def indices(name: str, values, size: int | None = None) -> np.ndarray:
             )
         values = np.arange(size)[values]
     try:
-        values = np.atleast_1d(values if isinstance(values, np.ndarray) or not np.iterable(values) else list(values))
+        values = np.atleast_1d(values if hasattr(values, "__array__") or not np.iterable(values) else list(values))
     except (TypeError, ValueError, RuntimeError):
         values = np.zeros((0, 0))
     truths = values.dtype == bool

@@ -40,6 +40,8 @@ def all_imports(path: Path) -> tuple[list[str], list[str]]:
 
     def visit(node: ast.AST, names: list[str]) -> None:
         for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING":
+                continue  # for type checkers, not imported
             if isinstance(child, ast.ImportFrom):
                 parts = (child.module or "").split(".")
                 if parts[0] == "ddg_warp":

@@ -1,6 +1,7 @@
 """Model: constant device data compiled from a scene: arrays, terms, dof map; and queries of a state."""
 
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -26,6 +27,13 @@ from ddg_warp.model.rod_group import RodGroup
 from ddg_warp.model.state import GripState, RodGroupState, State, check_state
 from ddg_warp.model.user_numbering import UserNumbering
 from ddg_warp.scene.grip import Grip
+from ddg_warp.scene.handle import OBSTACLE, ROD, SHELL, Handle
+
+if TYPE_CHECKING:
+    from ddg_warp.io.contact_records import Contacts
+    from ddg_warp.postprocess.quantities import Drag
+    from ddg_warp.postprocess.resultants import Stresses
+    from ddg_warp.solve.stepping.wrenches import Reactions
 
 
 @argument_checks.sealed
@@ -163,6 +171,30 @@ class Model:
         """Rows of `State.points` in one world."""
         return self.order.points_count
 
+    def rod(self, item: int | str) -> Handle:
+        """Return the handle of a rod from a name or index.
+
+        Raises:
+            SceneError: there is no such rod, or several have the name; see `rods`.
+        """
+        return self.order.handle(ROD, item)
+
+    def rods(self, name: str | None = None) -> list[Handle]:
+        """Return the handles of all rods, or of the rods with a name."""
+        names = self.curves.names[: self.scene.rod_count]
+        rows = np.arange(len(names)) if name is None else np.flatnonzero(names == name)
+        if name is not None and not len(rows):
+            self.order.handle(ROD, name)  # refused
+        return [Handle(row, ROD, names[row]) for row in rows.tolist()]
+
+    def shell(self, item: int | str) -> Handle:
+        """Return the handle of a shell from a name or index."""
+        return self.order.handle(SHELL, item)
+
+    def obstacle(self, item: int | str) -> Handle:
+        """Return the handle of an obstacle from a name or index."""
+        return self.order.handle(OBSTACLE, item)
+
     def report(self) -> str:
         """Return a text: content of the model, cost, and omissions."""
         from ddg_warp.postprocess.model_report import report
@@ -178,7 +210,7 @@ class Model:
         return energies(self, state)
 
     @one_at_a_time
-    def reactions(self, state: State, **options) -> list:
+    def reactions(self, state: State, **options) -> "Reactions":
         """Return forces and moments of the supports; see `ddg_warp.postprocess.quantities.reactions`."""
         from ddg_warp.postprocess.quantities import reactions
 
@@ -186,7 +218,7 @@ class Model:
         return reactions(self, state, **options)
 
     @one_at_a_time
-    def drag(self, state: State):
+    def drag(self, state: State) -> "Drag":
         """Return forces and power of the drag on rods; see `ddg_warp.postprocess.quantities.drag`."""
         from ddg_warp.postprocess.quantities import drag
 
@@ -202,7 +234,7 @@ class Model:
         return resolve_overlaps(self, state, gap)
 
     @one_at_a_time
-    def contacts(self, state: State):
+    def contacts(self, state: State) -> "Contacts":
         """Return the contact pairs of a state, an `io.contact_records.Contacts`; see `postprocess.contact_pairs`."""
         from ddg_warp.postprocess.contact_pairs import contacts
 
@@ -210,8 +242,8 @@ class Model:
         return contacts(self, state)
 
     @one_at_a_time
-    def stresses(self, state: State) -> dict:
-        """Return conjugate stresses of rods and shells by term; see `ddg_warp.postprocess.quantities.stresses`."""
+    def stresses(self, state: State) -> "Stresses":
+        """Return stresses of rods and shells; see `ddg_warp.postprocess.quantities.stresses`."""
         from ddg_warp.postprocess.quantities import stresses
 
         check_state("stresses", self, state)

@@ -1,5 +1,6 @@
 """State: positions, velocities, frames and history written by a step."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,7 @@ from ddg_warp import device_arrays as arrays
 from ddg_warp.capture_lock import launches
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import polyline
+from ddg_warp.scene.handle import OBSTACLE, Handle
 
 EQUILIBRIUM = ("stable", "outcome", "unbalanced", "sliding")  # set by static solvers
 VELOCITIES = ("v", "omega", "a", "alpha")
@@ -171,13 +173,28 @@ class State:
         """Slip velocities of dof blocks (W N,) for friction."""
         return self.coupled.v if self.sliding is None else self.sliding.velocity
 
-    def points(self) -> np.ndarray:
-        """Return positions (P, 3) or (worlds, P, 3) [m]: nodes in the order of `model.curves`, then vertices."""
-        return self.model.order.nodes([group.x.numpy() for group in self.groups], self.coupled and self.coupled.q)
+    def points(self, item: int | str | Sequence[int] | None = None) -> np.ndarray:
+        """Return positions (P, 3) or (worlds, P, 3) [m]: nodes in the order of `model.curves`, then vertices.
 
-    def velocities(self) -> np.ndarray:
-        """Return velocities of nodes, ordered as `points` [m/s]."""
-        return self.model.order.nodes([group.v.numpy() for group in self.groups], self.coupled and self.coupled.v)
+        Args:
+            item: name or handle of a rod, shell or obstacle, or index of a rod. Or several rods of equal node count, which give
+                (R, n, 3). By default all rods and shells.
+        """
+        return self._of_nodes(item, [group.x for group in self.groups], self.coupled and self.coupled.q)
+
+    def velocities(self, item: int | str | Sequence[int] | None = None) -> np.ndarray:
+        """Return velocities of nodes [m/s], ordered and chosen as in `points`."""
+        return self._of_nodes(item, [group.v for group in self.groups], self.coupled and self.coupled.v)
+
+    def _of_nodes(self, item, groups: list[wp.array], blocks: wp.array | None) -> np.ndarray:
+        order = self.model.order
+        item = order.find(item) if isinstance(item, str) else item
+        if isinstance(item, Handle) and item.kind == OBSTACLE:
+            nodes = self.model.coupled.host.obstacles[order.handle(OBSTACLE, item)]
+            values = blocks.numpy().astype(float).reshape(self.model.worlds, -1, 3)[:, nodes]
+            return values[0] if self.model.worlds == 1 else values
+        values = order.nodes([group.numpy() for group in groups], blocks)
+        return values if item is None else order.nodes_of(item, values)
 
     def obstacle_points(self) -> np.ndarray:
         """Return positions of nodes of moving obstacles (M, 3) or (worlds, M, 3) [m], see `Model.obstacles`."""
@@ -188,16 +205,36 @@ class State:
         values = self.coupled.q.numpy().astype(float).reshape(model.worlds, -1, 3)[:, nodes]
         return values[0] if model.worlds == 1 else values
 
-    def angles(self) -> np.ndarray | None:
-        """Return twist angles of edges (edges,) or (worlds, edges) [rad]; None if no rod has twist."""
+    def tangents(self, item: int | str | Sequence[int] | None = None) -> np.ndarray:
+        """Return unit tangents of edges (edges, 3) or (worlds, edges, 3), of all rods, or of rods chosen as in `points`."""
+        order, points = self.model.order, self.points()
+        edges = []
+        for curve, closed in enumerate(order.curves.closed):
+            nodes = points[..., order.node_starts[curve] : order.node_starts[curve + 1], :]
+            edges.append(np.diff(nodes, axis=-2, append=nodes[..., :1, :] if closed else nodes[..., :0, :]))
+        edges = np.concatenate(edges, axis=-2) if edges else points[..., :0, :]
+        tangents = edges / np.linalg.norm(edges, axis=-1, keepdims=True)
+        return tangents if item is None else order.edges_of(item, tangents, 3)
+
+    def angles(self, item: int | str | Sequence[int] | None = None) -> np.ndarray | None:
+        """Return twist angles of edges (edges,) or (worlds, edges) [rad]; None if no rod has twist.
+
+        Args:
+            item: rods chosen as in `points`.
+        """
         model = self.model
         coupled = None
         if model.coupled is not None and model.coupled.edges:
             coupled = self.coupled.q.numpy().reshape(model.worlds, -1, 3)[:, model.coupled.angle_start :, 0]
-        return model.order.edges([data.theta.numpy() for data in self.groups], coupled)
+        result = model.order.edges([data.theta.numpy() for data in self.groups], coupled)
+        return result if item is None or result is None else model.order.edges_of(item, result)
 
-    def directors(self) -> np.ndarray | None:
-        """Return the first material director of edges (edges, 3) or (worlds, edges, 3); None without twist."""
+    def directors(self, item: int | str | Sequence[int] | None = None) -> np.ndarray | None:
+        """Return the first material director of edges (edges, 3) or (worlds, edges, 3); None without twist.
+
+        Args:
+            item: rods chosen as in `points`.
+        """
         model = self.model
         values, coupled = [], None
         if model.coupled is not None and model.coupled.edges:
@@ -214,7 +251,8 @@ class State:
             frame, theta = arrays.download(data.frame), arrays.download(data.theta)
             u, t = np.moveaxis(frame[0:3], 0, -1), np.moveaxis(frame[3:6], 0, -1)
             values.append(polyline.material_directors(u, t, theta))
-        return model.order.edges(values, coupled, 3)
+        result = model.order.edges(values, coupled, 3)
+        return result if item is None or result is None else model.order.edges_of(item, result, 3)
 
     def poses(self) -> np.ndarray | None:
         """Return poses of grips (grips, 6) or (worlds, grips, 6) in the order of `model.grips`; None without."""

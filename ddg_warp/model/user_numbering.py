@@ -8,9 +8,11 @@ import warp as wp
 
 from ddg_warp import argument_checks
 from ddg_warp.compile import axisymmetric
+from ddg_warp.errors import SceneError
 from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.io.shapes import Curves, Surfaces
 from ddg_warp.model.rod_group import RodGroup
+from ddg_warp.scene.handle import AXISYMMETRIC, OBSTACLE, ROD, SHELL, Handle, named, need
 from ddg_warp.scene.material import DRAWN
 
 
@@ -70,7 +72,7 @@ class UserNumbering:
         """Rows of `State.points` from the coupled system, and the dof blocks that fill them."""
         if self.model.coupled is None:
             return np.zeros(0, int), np.zeros(0, int)
-        start, host = self._node_starts, self.model.coupled.host
+        start, host = self.node_starts, self.model.coupled.host
         rows = [start[rod.rod] + np.arange(len(rod.nodes)) for rod in host.rods]
         first = len(start) - 1 - len(host.meridians)
         rows += [start[first + i] + np.arange(len(shell.nodes)) for i, shell in enumerate(host.meridians)]
@@ -80,7 +82,7 @@ class UserNumbering:
 
     def places(self, group: RodGroup) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return for the nodes of a rod group: node with ghosts, column, row of `State.points`."""
-        return _user_index(group, group.host.own, self._node_starts)
+        return _user_index(group, group.host.own, self.node_starts)
 
     @property
     def points_count(self) -> int:
@@ -91,7 +93,7 @@ class UserNumbering:
         return int(self.curves.counts.sum()) + vertices
 
     @cached_property
-    def _node_starts(self) -> np.ndarray:
+    def node_starts(self) -> np.ndarray:
         """Offsets of the nodes of every curve (curves + 1,)."""
         return np.concatenate([[0], np.cumsum(self.curves.counts)])
 
@@ -146,6 +148,83 @@ class UserNumbering:
         rods = len(counts) - meridians
         return slice(int(counts[:rods].sum()), int(counts.sum()))
 
+    def handle(self, kind: str, item: int | str) -> Handle:
+        """Return the handle of a rod, shell, shell of revolution or obstacle from its name, index or handle."""
+        scene = self.model.scene
+        if kind == ROD:
+            return named(kind, item, self.curves.names[: scene.rod_count])
+        objects = {SHELL: scene.shells, AXISYMMETRIC: scene.axisymmetric_shells, OBSTACLE: scene.obstacles}[kind]
+        return named(kind, item, [each.name for each in objects])
+
+    def find(self, name: str) -> Handle:
+        """Return the handle of the rod, shell, shell of revolution or obstacle with a name.
+
+        Raises:
+            SceneError: nothing has the name, or several have it.
+        """
+        scene = self.model.scene
+        names = {ROD: set(self.curves.names[: scene.rod_count])}
+        for kind, objects in (
+            (SHELL, scene.shells),
+            (AXISYMMETRIC, scene.axisymmetric_shells),
+            (OBSTACLE, scene.obstacles),
+        ):
+            names[kind] = {each.name for each in objects}
+        kinds = [kind for kind, of_kind in names.items() if name in of_kind]
+        if not kinds:
+            raise SceneError(f"nothing is named {name!r}{argument_checks.meant(name, set().union(*names.values()))}")
+        if len(kinds) > 1:
+            raise SceneError(f"a {kinds[0]} and a {kinds[1]} are named {name!r}; give one by its handle")
+        return self.handle(kinds[0], name)
+
+    def nodes_of(self, item, values: np.ndarray) -> np.ndarray:
+        """Return of values (..., P, d) in user order the values of a rod, rods, a shell or a shell of revolution.
+
+        Args:
+            item: handle, name, index of a rod, or several rods of equal node count, which get an axis (..., R, n, d).
+            values: in the order of `State.points`.
+        """
+        item = self.find(item) if isinstance(item, str) else item
+        if isinstance(item, Handle) and item.kind == SHELL:
+            item = self.handle(SHELL, item)
+            start = int(self.curves.counts.sum()) + sum(len(s.points) for s in self.model.scene.shells[:item])
+            rows = start + np.arange(len(self.model.scene.shells[item].points))
+        elif isinstance(item, Handle) and item.kind == AXISYMMETRIC:
+            curve = self.model.scene.rod_count + self.handle(AXISYMMETRIC, item)
+            rows = self.node_starts[curve] + np.arange(self.curves.counts[curve])
+        else:
+            rows = self._rows_of(item, self.node_starts, "node")
+        return values[..., rows, :]
+
+    def edges_of(self, item, values: np.ndarray, width: int = 0) -> np.ndarray:
+        """Return of values (..., edges) or (..., edges, width) in user order the values of a rod, or of several, as `nodes_of`."""
+        rows = self._rows_of(item, self.edge_starts, "edge")
+        return values[..., rows, :] if width else values[..., rows]
+
+    def _rows_of(self, item, starts: np.ndarray, kind: str) -> np.ndarray:
+        if np.iterable(item) and not isinstance(item, str):
+            need(ROD, item)
+            rods = argument_checks.indices("rods", item, self.model.scene.rod_count)
+            for rod in rods[(rods < 0) | (rods >= self.model.scene.rod_count)][:1]:
+                raise SceneError(f"rod {rod} does not exist; there are {self.model.scene.rod_count}")
+            counts = starts[rods + 1] - starts[rods]
+            if (counts != counts[0]).any():
+                raise SceneError(
+                    f"rods have {counts.min()} to {counts.max()} {kind}s; take rods of one count at a time"
+                )
+            return starts[rods][:, None] + np.arange(counts[0])
+        rod = self.handle(ROD, item)
+        return np.arange(starts[rod], starts[rod + 1])
+
+    def row(self, node: tuple) -> int:
+        """Return the row of `State.points` of (rod, node) or (shell, vertex); a node counts from the end if negative."""
+        item, local = node
+        rows = self.nodes_of(item, np.arange(self.points_count)[:, None])[:, 0]
+        name = repr(item) if isinstance(item, Handle) else f"rod {item!r}"
+        if not -len(rows) <= (local := argument_checks.index("node", local)) < len(rows):
+            raise SceneError(f"node {local} does not exist: {name} has {len(rows)}")
+        return int(rows[local])
+
     def edge(self, row: int) -> tuple[int, int]:
         """Return edge and curve of a row of `State.angles`."""
         curve = int(np.searchsorted(self.edge_starts, row, side="right")) - 1
@@ -158,7 +237,7 @@ class UserNumbering:
     def put_nodes(self, group: RodGroup, values, out: np.ndarray, label: str) -> None:
         """Write values in user order (P, 3) to (node, column, dim) of a group."""
         values = self._points(values, label)[..., _axes(group)]
-        for rods in _rods_alike(group, group.host.own, self._node_starts):
+        for rods in _rods_alike(group, group.host.own, self.node_starts):
             for world in range(self.model.worlds):
                 rods.stored(out, world)[:] = rods.numbered(values if values.ndim == 2 else values[world])
 
@@ -202,7 +281,7 @@ class UserNumbering:
                 self.model.worlds, -1, 3
             )[:, indices]
         for group, value in zip(self.model.groups, values, strict=True):
-            for rods in _rods_alike(group, group.host.own, self._node_starts):
+            for rods in _rods_alike(group, group.host.own, self.node_starts):
                 for world in range(self.model.worlds):
                     rods.put(out[world][:, _axes(group)], rods.stored(value, world))
         return out[0] if self.model.worlds == 1 else out

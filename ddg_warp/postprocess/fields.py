@@ -111,7 +111,7 @@ def _elements(model, state) -> Iterator[tuple]:
         The term, strains and stresses (worlds, E, strains), energy per length (worlds, E), and arrays (E,) of rows of the points
         that an element contributes to, -1 for ghosts.
     """
-    from ddg_warp.postprocess.quantities import coupled_strains, group_strains
+    from ddg_warp.postprocess.element_strains import coupled_strains, group_strains
 
     start = np.concatenate([[0], np.cumsum(model.curves.counts)])
     for group, data in zip(model.groups, state.groups, strict=True):

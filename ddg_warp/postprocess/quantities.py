@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-import warp as wp
 
 from ddg_warp import argument_checks, device_arrays
 from ddg_warp.capture_lock import launches
@@ -11,9 +10,11 @@ from ddg_warp.kernels.terms import AXISYMMETRIC, MAGNETS, SHELLS
 from ddg_warp.model.model import check_model
 from ddg_warp.model.state import query
 from ddg_warp.postprocess import end_moments
+from ddg_warp.postprocess.element_strains import coupled_strains, group_strains
+from ddg_warp.postprocess.resultants import Stresses
 from ddg_warp.solve.equilibrium.tangent import Tangent
 from ddg_warp.solve.forces.drag import CoupledDrag, RodGroupDrag
-from ddg_warp.solve.stepping.wrenches import Reaction
+from ddg_warp.solve.stepping.wrenches import Reaction, Reactions
 
 TWIST = 2  # index of the twist among the strains of rod vertices and of half cells at joints
 
@@ -39,10 +40,11 @@ def energies(model, state) -> dict:
 
 
 @launches
-def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
+def reactions(model, state, point=None, factor: float = 1.0) -> Reactions:
     """Return the reaction of every support of the scene at a state; `Integrator.wrenches` is for a step.
 
-    Supports are ordered as added: of rods, then of shells, rings and obstacles.
+    Supports are ordered as added: of rods, then of shells, rings and obstacles. `reactions(...)["left"]` is that of a support or
+    obstacle by name; the handle that `clamp`, `fix`, `hold` or `add_obstacle` returned is an index, too.
 
     Reactions balance internal forces and loads on fixed dofs, and the normals of clamped mesh edges and planes of symmetry. Forces of
     strain-rate damping are left out, as are inertia of and drag on a fixed node, which a moving support would have to add. The
@@ -64,14 +66,16 @@ def reactions(model, state, point=None, factor: float = 1.0) -> list[Reaction]:
         model.touch.evaluate(state.coupled.q, state.coupled.rate)
         loads[-1] = loads[-1] + model.touch.terms.forces.numpy().astype(float).ravel()
     result = model.static_wrenches.at(state, loads)
-    if point is None:
-        return result
-    return [
-        Reaction(
-            each.force, each.moment + np.cross(each.point - point, each.force), np.broadcast_to(point, each.point.shape)
-        )
-        for each in result
-    ]
+    if point is not None:
+        result = [
+            Reaction(
+                each.force,
+                each.moment + np.cross(each.point - point, each.force),
+                np.broadcast_to(point, each.point.shape),
+            )
+            for each in result
+        ]
+    return Reactions(result, model.scene)
 
 
 @dataclass(frozen=True)
@@ -141,8 +145,11 @@ def _each_world(values: np.ndarray) -> np.ndarray:
 
 
 @launches
-def stresses(model, state) -> dict[str, list[np.ndarray]]:
+def stresses(model, state) -> Stresses:
     """Return conjugate stresses of every rod and shell by term (elements, strains), or (worlds, elements, strains).
+
+    `stresses(...).rod(rod)` has axial force, shear, moments and torque of one rod in space, `stresses(...).shell(shell)` membrane
+    forces, moments and equivalent stress of one shell; see `postprocess.resultants`.
 
     Rods: axial force [N] of edges, moments [N m] of vertices about their directors. These are means of both edges, and at clamped
     ends, which are included, the directors of the clamp. Moments next to rigid joints are in "rigid_joint", about the directors of
@@ -173,26 +180,7 @@ def stresses(model, state) -> dict[str, list[np.ndarray]]:
     for index, part in enumerate(model.coupled.sets if model.coupled is not None else ()):
         if part.term.name not in MAGNETS:
             _add_coupled_stresses(model, state, index, result)
-    return result
-
-
-def group_strains(model, group, data) -> tuple[np.ndarray, np.ndarray]:
-    """Return strains and stresses of a rod group (strains, nodes, worlds, rods)."""
-    shape = (group.kind.strain_rows, group.nodes, group.columns)
-    strain, stress = (device_arrays.allocate(shape, model.types.real, model.wp_device) for _ in range(2))
-    model.strains(group, data, strain, stress)
-    split = (*shape[:2], group.worlds, group.rods)
-    return device_arrays.download(strain).reshape(split), device_arrays.download(stress).reshape(split)
-
-
-def coupled_strains(coupled, state, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return strains and stresses of an element set (strains, worlds, elements)."""
-    part = coupled.sets[index]
-    shape = (len(part.term.measure.strains), coupled.worlds * part.elements)
-    strain, stress = (wp.zeros(shape, dtype=coupled.real, device=coupled.device) for _ in range(2))
-    coupled.strains(state.coupled, index, strain, stress)
-    split = (shape[0], coupled.worlds, part.elements)
-    return strain.numpy().astype(float).reshape(split), stress.numpy().astype(float).reshape(split)
+    return Stresses(result, model, state)
 
 
 @launches

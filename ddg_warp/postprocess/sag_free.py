@@ -23,7 +23,7 @@ from ddg_warp.errors import SceneError
 from ddg_warp.kernels.densities.quadratic import quadratic
 from ddg_warp.model.model import check_model
 from ddg_warp.model.state import query
-from ddg_warp.postprocess.quantities import group_strains
+from ddg_warp.postprocess.element_strains import group_strains
 from ddg_warp.solve.equilibrium.rigid_modes import rigid_modes
 from ddg_warp.solve.equilibrium.stability import lowest_factors
 from ddg_warp.solve.equilibrium.tangent import Tangent

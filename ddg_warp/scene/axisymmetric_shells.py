@@ -10,6 +10,7 @@ from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.scene import validate
 from ddg_warp.scene.grip import Grip
+from ddg_warp.scene.handle import AXISYMMETRIC, RING_SUPPORT, Handle, need
 from ddg_warp.scene.material import Material
 from ddg_warp.scene.prescribed_motion import Motion
 
@@ -38,6 +39,7 @@ class RingSupport:
     clamped: bool = False
     motion: Motion | Grip | None = None
     call: str = "hold_ring"  # method of the scene, for messages
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ class Meridians:
 
     def add_axisymmetric_shell(
         self, points, *, thickness, material: Material, rest="shape", name: str = "shell of revolution"
-    ) -> int:
+    ) -> Handle:
         """Add a shell of revolution about the z axis with axisymmetric deformation, by its meridian in the plane of x and z.
 
         An end of the meridian on the axis is a pole, which stays on the axis with a smooth surface. Other ends are rims, free by
@@ -89,7 +91,7 @@ class Meridians:
             name: shown in reports and output.
 
         Returns:
-            Index among the axisymmetric shells.
+            Handle among the axisymmetric shells.
 
         Raises:
             SceneError: no valid meridian; the message names shell and node.
@@ -111,19 +113,27 @@ class Meridians:
         points.setflags(write=False)
         thickness.setflags(write=False)
         self.axisymmetric_shells.append(AxisymmetricShell(points, thickness, deepcopy(material), deepcopy(rest), name))
-        return len(self.axisymmetric_shells) - 1
+        return Handle(len(self.axisymmetric_shells) - 1, AXISYMMETRIC, name)
 
-    def hold_ring(self, shell: int, nodes, components: str = "xz", motion: Motion | Grip | None = None) -> None:
+    def hold_ring(
+        self, shell: int, nodes, components: str = "xz", motion: Motion | Grip | None = None, name: str = ""
+    ) -> Handle:
         """Fix radius ("x") or height ("z") of nodes of a meridian, free to rotate (simply supported).
 
         `motion` moves the nodes in the plane of x and z, by a translation, which may differ between nodes, and a rotation about the y
-        axis.
+        axis. `name` is the support's in `Model.reactions`.
         """
-        self._hold_ring(RingSupport(shell, self._nodes(shell, nodes), components, motion=motion))
+        return self._hold_ring(RingSupport(shell, self._nodes(shell, nodes), components, motion=motion, name=name))
 
     def clamp_ring(
-        self, shell: int, end: str, components: str = "xz", tangent=None, motion: Motion | Grip | None = None
-    ) -> None:
+        self,
+        shell: int,
+        end: str,
+        components: str = "xz",
+        tangent=None,
+        motion: Motion | Grip | None = None,
+        name: str = "",
+    ) -> Handle:
         """Clamp a rim, the "first" or "last" node: fix components and the direction of the meridian, which a motion rotates.
 
         Args:
@@ -139,17 +149,17 @@ class Meridians:
                 f"clamp_ring: the {end} node of shell {shell} is a pole, which has its direction; use hold_ring"
             )
         nodes = self._nodes(shell, node)
-        support = RingSupport(shell, nodes, components, tangent=tangent, clamped=True, motion=motion, call="clamp_ring")
-        self._hold_ring(support)
+        options = {"tangent": tangent, "clamped": True, "motion": motion, "call": "clamp_ring", "name": name}
+        return self._hold_ring(RingSupport(shell, nodes, components, **options))
 
-    def symmetry_ring(self, shell: int, end: str) -> None:
+    def symmetry_ring(self, shell: int, end: str, name: str = "") -> Handle:
         """Add a symmetry plane normal to the axis at a rim, orthogonal to the meridian."""
         node = self._end(shell, end)
         points = self.axisymmetric_shells[shell].points
         edge = points[1] - points[0] if node == 0 else points[-1] - points[-2]
-        self.clamp_ring(shell, end, "z", tangent=(0.0, np.copysign(1.0, edge[1])))
+        return self.clamp_ring(shell, end, "z", tangent=(0.0, np.copysign(1.0, edge[1])), name=name)
 
-    def add_ring_force(self, shell: int, nodes, force, amplitude: Callable[[float], float] | None = None) -> None:
+    def add_ring_force(self, shell: int, nodes, force, amplitude: Callable[[float], float] | None = None) -> Handle:
         """Add a dead force per length of ring at rest on nodes (2,) or (n, 2): radial and axial [N/m]."""
         nodes = argument_checks.once("add_ring_force: nodes", self._nodes(shell, nodes))
         radius = self.axisymmetric_shells[shell].points[nodes, 0]
@@ -158,8 +168,9 @@ class Meridians:
         force = argument_checks.broadcast("add_ring_force: force", force, (len(nodes), 2), own=1)
         amplitude = argument_checks.amplitude("add_ring_force", amplitude)
         self.ring_loads.append(RingLoad(shell, nodes, 2.0 * np.pi * radius[:, None] * force, amplitude))
+        return Handle(len(self.ring_loads) - 1, "ring load")
 
-    def add_pole_force(self, shell: int, force: float, end: str = "first", amplitude=None) -> None:
+    def add_pole_force(self, shell: int, force: float, end: str = "first", amplitude=None) -> Handle:
         """Add a dead axial force [N] on a pole."""
         node = self._end(shell, end)
         if self.axisymmetric_shells[shell].points[node, 0] != 0.0:
@@ -167,10 +178,11 @@ class Meridians:
         force = np.array([[0.0, argument_checks.number("add_pole_force: force", force)]])
         amplitude = argument_checks.amplitude("add_pole_force", amplitude)
         self.ring_loads.append(RingLoad(shell, self._nodes(shell, node), force, amplitude))
+        return Handle(len(self.ring_loads) - 1, "ring load")
 
     def add_axisymmetric_pressure(
         self, shell: int, pressure, edges=None, *, dead: bool = False, amplitude=None
-    ) -> None:
+    ) -> Handle:
         """Add pressure [Pa] on edges (all by default), towards the left of the meridian in the plane of x and z.
 
         Pressure is a follower load: statics uses its exact load stiffness; in dynamics its forces are time-lagged, evaluated on the
@@ -187,8 +199,11 @@ class Meridians:
         pressure = argument_checks.broadcast(f"{call}: pressure", pressure, index.shape)
         dead, amplitude = argument_checks.flag(f"{call}: dead", dead), argument_checks.amplitude(call, amplitude)
         self.ring_pressures.append(RingPressure(shell, index, pressure, dead, amplitude))
+        return Handle(len(self.ring_pressures) - 1, "ring pressure")
 
-    def _hold_ring(self, support: RingSupport) -> None:
+    def _hold_ring(self, support: RingSupport) -> Handle:
+        if support.name:
+            argument_checks.text(f"{support.call}: name", support.name)
         argument_checks.components(support.call, support.components, "xz")
         motion = support.motion
         validate.check_motion(support.call, motion, planar=True)
@@ -197,12 +212,14 @@ class Meridians:
                 f"{support.call}: the motion has {motion.count} displacements of {len(support.nodes)} nodes; give one for each"
             )
         self.ring_supports.append(support)
+        return Handle(len(self.ring_supports) - 1, RING_SUPPORT, support.name)
 
     def _end(self, shell, end: str) -> int:
         self._check_axisymmetric(shell)
         return ENDS[argument_checks.choice("end", end, tuple(ENDS))]
 
     def _check_axisymmetric(self, shell) -> None:
+        need(AXISYMMETRIC, shell)
         count = len(self.axisymmetric_shells)
         if not 0 <= argument_checks.index("shell", shell) < count:
             raise SceneError(f"axisymmetric shell {shell} does not exist; the scene has {count} so far")

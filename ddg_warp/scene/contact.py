@@ -9,6 +9,7 @@ import numpy as np
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.scene.grip import Grip
+from ddg_warp.scene.handle import OBSTACLE, Handle
 from ddg_warp.scene.law import Law, is_law
 from ddg_warp.scene.obstacles import Capsule, Mesh, Obstacle, Plane, Sphere
 from ddg_warp.scene.prescribed_motion import Motion
@@ -193,7 +194,7 @@ class Contacts:
 
     def add_obstacle(
         self, shape: Plane | Sphere | Capsule | Mesh, *, motion: Motion | Grip | None = None, name: str = "obstacle"
-    ) -> int:
+    ) -> Handle:
         """Add a kinematic rigid collider to a scene with `contact`.
 
         Args:
@@ -204,7 +205,7 @@ class Contacts:
             name: of the obstacle in `contact_between` and output.
 
         Returns:
-            Index of the obstacle.
+            Handle of the obstacle.
 
         Raises:
             SceneError: an invalid shape, or a motion that does not fit.
@@ -223,7 +224,7 @@ class Contacts:
                 "of a Mesh give one for each vertex, of other shapes one for all"
             )
         self.obstacles.append(Obstacle(shape, motion, name))
-        return len(self.obstacles) - 1
+        return Handle(len(self.obstacles) - 1, OBSTACLE, name)
 
 
 def check_contact(scene) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry.surface import Surface
-from ddg_warp.scene.equilibrium_path import Displacement, StopCriterion
+from ddg_warp.scene.equilibrium_path import Displacement, StopCriterion, watched_displacements
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.law import Law
 from ddg_warp.scene.material import Material, Stiffness
@@ -76,12 +76,12 @@ class PathAnalysis:
     """Arc-length continuation of equilibria from load parameter 0, through limit points.
 
     Attributes:
-        watch: displacements to record by name (`Displacement`).
+        watch: displacements to record by name, each a `Displacement`, or (rod, node) for all of its components as "name.x" and so on.
         stop: termination criteria.
         step, max_step, load_scale: see `ddg_warp.solve.equilibrium.continuation.ContinuationOptions`.
     """
 
-    watch: dict[str, Displacement] = field(default_factory=dict)
+    watch: dict[str, Displacement | tuple[int | str, int]] = field(default_factory=dict)
     stop: StopCriterion = field(default_factory=StopCriterion)
     step: float = 0.02
     max_step: float = 0.1
@@ -92,11 +92,7 @@ class PathAnalysis:
             argument_checks.positive(f"PathAnalysis: {name}", getattr(self, name))
         if not isinstance(self.stop, StopCriterion):
             raise SceneError(f"PathAnalysis: stop is {self.stop!r}; give StopCriterion(...)")
-        if not isinstance(self.watch, dict) or not all(isinstance(w, Displacement) for w in self.watch.values()):
-            raise SceneError(
-                f"PathAnalysis: watch is {argument_checks.shown(self.watch)}; give displacements by name, "
-                "{'tip': Displacement.of(row, axis)}"
-            )
+        watched_displacements("PathAnalysis", self.watch, planar=False)
 
 
 @dataclass
@@ -154,6 +150,7 @@ class Support:
     tangent: np.ndarray | None = None
     director: np.ndarray | None = None
     call: str = "fix"  # method of the scene, for messages
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -207,6 +204,7 @@ class ShellSupport:
     normal: tuple = (0.0, 0.0, 0.0)
     motion: Motion | Grip | None = None
     call: str = "hold"  # method of the scene, for messages
+    name: str = ""
 
 
 @dataclass(frozen=True)

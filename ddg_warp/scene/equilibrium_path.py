@@ -1,5 +1,6 @@
 """Equilibrium paths of a continuation, with watched displacements and termination criteria."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,30 +18,32 @@ class Displacement:
     """Displacement from rest [m] of a point along an axis, or a weighted sum of several.
 
     Attributes:
-        terms: (row of `State.points`, axis "x", "y" or "z", weight) of each term.
+        terms: (point, axis "x", "y" or "z", weight) of each term. A point is (rod, node), (shell, vertex), or a row of
+            `State.points`; rods by index, handle or name, shells by handle or name.
     """
 
-    terms: tuple[tuple[int, str, float], ...]
+    terms: tuple[tuple[int | tuple[int | str, int], str, float], ...]
 
     def __post_init__(self):
         terms = self.terms if isinstance(self.terms, tuple | list) else [self.terms]
         if not terms:
-            raise SceneError(
-                "Displacement: there are no terms; give (row of the points, axis, weight) each, one at least"
-            )
+            raise SceneError("Displacement: there are no terms; give (point, axis, weight) each, one at least")
         for term in terms:
             if not isinstance(term, tuple | list) or len(term) != 3:
                 raise SceneError(
-                    f"Displacement: {argument_checks.shown(term)} is no term; give (row of the points, axis, weight) each"
+                    f"Displacement: {argument_checks.shown(term)} is no term; give (point, axis, weight) each"
                 )
-            argument_checks.index("Displacement: point", term[0])
+            if is_node(term[0]):
+                argument_checks.index("Displacement: node", term[0][1])
+            else:
+                argument_checks.index("Displacement: point", term[0])
             argument_checks.choice("Displacement: axis", term[1], ("x", "y", "z"))
             argument_checks.number("Displacement: weight", term[2])
 
     @classmethod
-    def of(cls, row: int, axis: str, weight: float = 1.0) -> "Displacement":
-        """Return the displacement of one point; weight -1 reverses the axis."""
-        return cls(((row, axis, weight),))
+    def of(cls, point: int | tuple[int | str, int], axis: str, weight: float = 1.0) -> "Displacement":
+        """Return the displacement of one point, (rod, node) or a row of `State.points`; weight -1 reverses the axis."""
+        return cls(((point, axis, weight),))
 
     def vector(self, tangent) -> np.ndarray:
         """Return the derivative with respect to all dofs (size,).
@@ -49,7 +52,8 @@ class Displacement:
             SceneError: an unknown point or axis.
         """
         dofs, result = tangent.point_dofs(), np.zeros(tangent.size)
-        for row, axis, weight in self.terms:
+        for point, axis, weight in self.terms:
+            row = tangent.model.order.row(point) if is_node(point) else point
             if not -len(dofs) <= row < len(dofs) or axis not in ("x", "y", "z"):
                 raise SceneError(
                     f"displacement of point {row} along {axis!r}: there are {len(dofs)} points, axes x, y and z"
@@ -59,6 +63,34 @@ class Displacement:
                 raise SceneError(f"displacement of point {row} along {axis!r}: the scene is planar")
             result[dof] += weight
         return tangent.into(result)
+
+
+def is_node(value) -> bool:
+    """Return True for (rod, node) or (shell, vertex)."""
+    return isinstance(value, tuple | list) and len(value) == 2 and not np.iterable(value[1])
+
+
+def watched_displacements(call: str, watch, planar: bool) -> dict[str, Displacement]:
+    """Return displacements by name; (rod, node) under a name "d" becomes "d.x", "d.y" and "d.z".
+
+    Raises:
+        SceneError: no mapping of names to displacements or nodes.
+    """
+    if not isinstance(watch, Mapping):
+        raise SceneError(f"{call}: watch is {argument_checks.shown(watch)}; give displacements by name")
+    result = {}
+    for name, value in watch.items():
+        argument_checks.text(f"{call}: a name in watch", name)
+        if is_node(value):
+            result |= {f"{name}.{axis}": Displacement.of(value, axis) for axis in ("xz" if planar else "xyz")}
+        elif isinstance(value, Displacement):
+            result[name] = value
+        else:
+            shown = argument_checks.shown(value)
+            raise SceneError(
+                f"{call}: watch[{name!r}] is {shown}; give (rod, node) or Displacement.of((rod, node), axis)"
+            )
+    return result
 
 
 @dataclass(eq=False)

@@ -4,7 +4,8 @@ import warnings
 from bisect import bisect_right
 from collections.abc import Callable, Mapping
 from copy import copy, deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,11 +15,15 @@ from ddg_warp.scene import drag, validate
 from ddg_warp.scene.descriptions import Dynamics, Load, PathAnalysis, RodBatch, Statics, Support
 from ddg_warp.scene.field import Fields
 from ddg_warp.scene.grip import Grip
+from ddg_warp.scene.handle import LOAD, ROD, SUPPORT, Handle, Handles, need
 from ddg_warp.scene.law import Law, laws_of
 from ddg_warp.scene.material import Material, Stiffness, stiffness_of
 from ddg_warp.scene.prescribed_motion import Motion
 from ddg_warp.scene.shells_and_joints import Structures
 from ddg_warp.scene.user_force import UserForces
+
+if TYPE_CHECKING:
+    from ddg_warp.model.model import Model
 
 
 @argument_checks.called
@@ -102,8 +107,8 @@ class Scene(Structures, Fields, UserForces):
         name: str = "rod",
         laws: Mapping[str, Law] | None = None,
         curvature: str = "tangent",
-    ) -> int:
-        """Add one rod with points (n, 3) and return its index; arguments as in `add_rods`, a director (3,) or (edges, 3)."""
+    ) -> Handle:
+        """Add one rod with points (n, 3) and return its handle; arguments as in `add_rods`, a director (3,) or (edges, 3)."""
         if director is not None:
             director = argument_checks.array(f"rods '{name}': director", director, "give (3,) or (edges, 3)")
             director = director[None] if director.ndim == 2 and len(director) > 1 else director
@@ -125,11 +130,12 @@ class Scene(Structures, Fields, UserForces):
         name: str = "rod",
         laws: Mapping[str, Law] | None = None,
         curvature: str = "tangent",
-    ) -> range:
-        """Add rods of equal node count.
+    ) -> Handles:
+        """Add rods.
 
         Args:
-            points: nodes at rest (R, n, 3) [m]; distances are the rest lengths.
+            points: nodes at rest (R, n, 3) [m], or a list of arrays (n, 3) of any n; distances are the rest lengths. Rods of one
+                n after each other are stored together, so that sorted rods compile fastest.
             section: `Circle`, `Ellipse`, `Rectangle`, `Ribbon` (with a material) or `Stiffness`.
             material: `Material`; not needed with `Stiffness`.
             closed: whether the last node is joined to the first.
@@ -149,12 +155,16 @@ class Scene(Structures, Fields, UserForces):
                 prevent folding over. See `ddg_warp.kernels.measures.turning_angle`.
 
         Returns:
-            Indices of the rods.
+            Handles of the rods.
 
         Raises:
             SceneError: no valid rod; the message names rod and node.
         """
         argument_checks.text("add_rods: name", name)
+        if runs := _runs(points):
+            options = {"material": material, "closed": closed, "twist": twist, "bend": bend, "name": name}
+            options |= {"laws": laws, "curvature": curvature}
+            return self._add_unequal(points, runs, section, natural, director, options)
         points = argument_checks.array(f"rods '{name}': points", points, "give (rods, nodes, 3)").copy()
         if director is not None:
             director = argument_checks.array(
@@ -196,17 +206,37 @@ class Scene(Structures, Fields, UserForces):
             not (isinstance(section, Stiffness) or laws),
         )
         self.batches.append(batch)
-        return range(batch.first, batch.first + batch.rods)
+        return Handles(range(batch.first, batch.first + batch.rods), name)
 
-    def clamp(self, rods, edges=(0,), motion: Motion | Grip | None = None) -> None:
+    def _add_unequal(self, points, runs: list[slice], section, natural, director, options: dict) -> Handles:
+        """Add rods in runs of equal node count, all or none."""
+        first, batches, count = self.rod_count, len(self.batches), len(points)
+        stiffness_of(f"rods '{options['name']}'", section, options["material"])
+        several = isinstance(natural, list | tuple)
+        try:
+            for rods in runs:
+                values = {each.name: _of_rods(getattr(section, each.name), rods, count) for each in fields(section)}
+                self.add_rods(
+                    np.stack([argument_checks.array("add_rods: points", each) for each in points[rods]]),
+                    section=replace(section, **values),
+                    natural=[_of_rods(value, rods, count) for value in natural] if several else natural,
+                    director=_of_rods(director, rods, count),
+                    **options,
+                )
+        except SceneError:
+            del self.batches[batches:]
+            raise
+        return Handles(range(first, self.rod_count), options["name"])
+
+    def clamp(self, rods, edges=(0,), motion: Motion | Grip | None = None, name: str = "") -> Handle:
         """Clamp edges: fix both nodes and the twist angle. The continuum clamp then lies at the middle of the edge.
 
         Negative indices count from the last edge; a mask of bools or a slice is accepted, too. `motion` prescribes the edges; by
-        default they stay at rest.
+        default they stay at rest. `name` is the support's in `Model.reactions`.
         """
         rods, edges = self._on_rods("clamp", rods, "edge", edges)
         nodes = tuple(dict.fromkeys(n for e in edges for n in ((e, e + 1) if e >= 0 else (e - 1, e))))
-        self._support("clamp", rods, nodes=nodes, edges=edges, motion=motion)
+        return self._support("clamp", rods, nodes=nodes, edges=edges, motion=motion, name=name)
 
     def clamp_end(
         self,
@@ -216,7 +246,8 @@ class Scene(Structures, Fields, UserForces):
         components: str = "xyz",
         tangent=None,
         director=None,
-    ) -> None:
+        name: str = "",
+    ) -> Handle:
         """Fix position and frame exactly at an end node, with the tangent prescribed at the node and an end cell of half size.
 
         Args:
@@ -228,6 +259,7 @@ class Scene(Structures, Fields, UserForces):
                 shape from its points is stress-free with it. By default extrapolated from the two edges at the end.
             director: first material director at the end at rest, (3,) or (rods, 3), made perpendicular to the tangent; by default
                 extrapolated with the rotation of the directors along the rod.
+            name: of the support in `Model.reactions`.
 
         Raises:
             SceneError: an invalid end, tangent or director; the message names it.
@@ -250,32 +282,32 @@ class Scene(Structures, Fields, UserForces):
                     f"clamp_end: rod {batch.first} ('{batch.name}') has no twist, and so no director; leave director out"
                 )
         options = {"components": components, "end": end, "tangent": tangent, "director": director}
-        self._support("clamp_end", rods, motion=motion, **options)
+        return self._support("clamp_end", rods, motion=motion, name=name, **options)
 
-    def fix(self, rods, nodes, components: str = "xyz", motion: Motion | Grip | None = None) -> None:
+    def fix(self, rods, nodes, components: str = "xyz", motion: Motion | Grip | None = None, name: str = "") -> Handle:
         """Fix components of nodes (a hinge). A motion may give a displacement for every node."""
         rods, nodes = self._on_rods("fix", rods, "node", nodes)
-        self._support("fix", rods, nodes=nodes, components=components, motion=motion)
+        return self._support("fix", rods, nodes=nodes, components=components, motion=motion, name=name)
 
-    def fix_twist(self, rods, edges, motion: Motion | Grip | None = None) -> None:
+    def fix_twist(self, rods, edges, motion: Motion | Grip | None = None, name: str = "") -> Handle:
         """Fix the twist angle of edges."""
         rods, edges = self._on_rods("fix_twist", rods, "edge", edges)
         self._need_twist("fix_twist", rods)
-        self._support("fix_twist", rods, edges=edges, motion=motion)
+        return self._support("fix_twist", rods, edges=edges, motion=motion, name=name)
 
-    def add_force(self, rods, node: int, force, amplitude: Callable[[float], float] | None = None) -> None:
+    def add_force(self, rods, node: int, force, amplitude: Callable[[float], float] | None = None) -> Handle:
         """Add a dead force [N] on a node, times amplitude(t). In statics it grows with the load parameter if amplitude is None."""
         force = argument_checks.vector(f"add_force: force on node {node}", force)
         self._in_plane("add_force: force", force, (1,))
-        self._load("add_force", rods, "node", node, amplitude, force=force)
+        return self._load("add_force", rods, "node", node, amplitude, force=force)
 
-    def add_twisting_moment(self, rods, edge: int, moment: float, amplitude=None) -> None:
+    def add_twisting_moment(self, rods, edge: int, moment: float, amplitude=None) -> Handle:
         """Add a moment [N m] about the tangent of an edge, conjugate to the twist angle."""
         self._need_twist("add_twisting_moment", self._rods(rods))
         moment = argument_checks.number(f"add_twisting_moment: moment on edge {edge}", moment)
-        self._load("add_twisting_moment", rods, "edge", edge, amplitude, moment=moment)
+        return self._load("add_twisting_moment", rods, "edge", edge, amplitude, moment=moment)
 
-    def add_couple(self, rods, edge: int, couple, amplitude=None) -> None:
+    def add_couple(self, rods, edge: int, couple, amplitude=None) -> Handle:
         """Add a couple (3,) [N m] on an edge with axis fixed in space: a pair of forces across the edge and a moment about it.
 
         Out of plane it has no potential (Ziegler, Principles of Structural Stability, 1968). Statics treats it exactly; in
@@ -283,7 +315,7 @@ class Scene(Structures, Fields, UserForces):
         """
         couple = argument_checks.vector(f"add_couple: couple on edge {edge}", couple)
         self._in_plane("add_couple: couple", couple, (0, 2))
-        self._load("add_couple", rods, "edge", edge, amplitude, couple=couple)
+        return self._load("add_couple", rods, "edge", edge, amplitude, couple=couple)
 
     def add_mass(self, rods, node: int, mass: float) -> None:
         """Add a point mass [kg] on a node."""
@@ -320,7 +352,9 @@ class Scene(Structures, Fields, UserForces):
         rods = argument_checks.once("drag: rods", self._rods(rods))
         self.drags.append(drag.rod_drag(self.batches, rods, law, tangential, normal, rotational, nodes))
 
-    def build(self, device=None, precision: str | None = None, worlds: int = 1, allow_rounding: bool = False):
+    def build(
+        self, device=None, precision: str | None = None, worlds: int = 1, allow_rounding: bool = False
+    ) -> "Model":
         """Compile the current scene into a `Model` on a device.
 
         Args:
@@ -355,6 +389,7 @@ class Scene(Structures, Fields, UserForces):
         return result
 
     def _rods(self, rods) -> np.ndarray:
+        need(ROD, rods)
         index = argument_checks.indices("rods", rods, self.rod_count)
         missing = index[(index < 0) | (index >= self.rod_count)]
         if missing.size:
@@ -375,7 +410,8 @@ class Scene(Structures, Fields, UserForces):
             validate.check_index(kind, item, size, rods)
         return rods, tuple(chosen.tolist())
 
-    def _support(self, call: str, rods: np.ndarray, *, motion, components: str = "xyz", **dofs) -> None:
+    def _support(self, call: str, rods: np.ndarray, *, motion, components: str = "xyz", name: str, **dofs) -> Handle:
+        name = name and argument_checks.text(f"{call}: name", name)
         argument_checks.components(call, components)
         validate.check_motion(call, motion, planar=self.dimension == 2)
         if motion is not None and motion.count is not None:
@@ -385,12 +421,14 @@ class Scene(Structures, Fields, UserForces):
                 raise SceneError(
                     f"fix: the motion has {motion.count} displacements of {count} nodes; give one for each"
                 )
-        self.supports.append(Support(rods, components=components, motion=motion, call=call, **dofs))
+        self.supports.append(Support(rods, components=components, motion=motion, call=call, name=name, **dofs))
+        return Handle(len(self.supports) - 1, SUPPORT, name)
 
-    def _load(self, call: str, rods, kind: str, item, amplitude, **load) -> None:
+    def _load(self, call: str, rods, kind: str, item, amplitude, **load) -> Handle:
         rods = argument_checks.once(f"{call}: rods", self._rods(rods))
         rods, (item,) = self._on_rods(call, rods, kind, argument_checks.index(f"{call}: {kind}", item))
         self.loads.append(Load(rods, amplitude=argument_checks.amplitude(call, amplitude), **{kind: item}, **load))
+        return Handle(len(self.loads) - 1, LOAD)
 
     def _need_twist(self, call: str, rods: np.ndarray) -> None:
         for batch in self._batches(rods):
@@ -413,3 +451,19 @@ class Scene(Structures, Fields, UserForces):
         near = self.batches[first - 1 : last]
         starts = [batch.first for batch in near]
         return [near[i] for i in np.unique(np.searchsorted(starts, rods, side="right") - 1)]
+
+
+def _runs(points) -> list[slice]:
+    """Return runs of rods of equal node count; none if all have one count."""
+    if not isinstance(points, list | tuple) or not all(getattr(each, "ndim", 0) == 2 for each in points):
+        return []
+    ends = np.flatnonzero(np.diff([len(each) for each in points])) + 1
+    edges = [0, *ends.tolist(), len(points)]
+    return list(map(slice, edges[:-1], edges[1:])) if ends.size else []
+
+
+def _of_rods(value, rods: slice, count: int):
+    """Return the values of some rods, of values with an axis of `count` rods before others; others are for all."""
+    if isinstance(value, list | tuple) and len(value) == count and all(np.ndim(each) for each in value):
+        return np.stack(value[rods])
+    return value[rods] if np.ndim(value) > 1 and len(value) == count else value

@@ -16,6 +16,7 @@ from ddg_warp.scene.axisymmetric_shells import Meridians
 from ddg_warp.scene.contact import Contacts
 from ddg_warp.scene.descriptions import Attachment, EdgeCouple, Joint, Pressure, Shell, ShellLoad, ShellSupport
 from ddg_warp.scene.grip import Grip
+from ddg_warp.scene.handle import SHELL, SHELL_SUPPORT, Handle, need
 from ddg_warp.scene.law import Law, laws_of
 from ddg_warp.scene.magnets import Magnets
 from ddg_warp.scene.material import Material
@@ -49,7 +50,7 @@ class Structures(Meridians, Magnets, Contacts):
         rest="shape",
         name: str = "shell",
         laws: Mapping[str, Law] | None = None,
-    ) -> int:
+    ) -> Handle:
         """Add a triangle mesh as a thin shell.
 
         Args:
@@ -67,7 +68,7 @@ class Structures(Meridians, Magnets, Contacts):
             laws: a `Law` for terms by name, such as "shell_stretch" or "shell_bend_dof", instead of the material's.
 
         Returns:
-            Index of the shell.
+            Handle of the shell.
 
         Raises:
             SceneError: no valid surface; the message names shell and triangle.
@@ -91,18 +92,20 @@ class Structures(Meridians, Magnets, Contacts):
         laws = laws_of(f"shell '{name}'", laws)
         _warn_of_pieces(surface)
         self.shells.append(Shell(surface, thickness, deepcopy(material), bending, membrane, rest, name, laws))
-        return len(self.shells) - 1
+        return Handle(len(self.shells) - 1, SHELL, name)
 
-    def hold(self, shell: int, vertices, components: str = "xyz", motion: Motion | Grip | None = None) -> None:
+    def hold(
+        self, shell: int, vertices, components: str = "xyz", motion: Motion | Grip | None = None, name: str = ""
+    ) -> Handle:
         """Fix or prescribe components of vertices of a shell, free to rotate (simply supported).
 
-        `motion` may give a displacement for every vertex.
+        `motion` may give a displacement for every vertex. `name` is the support's in `Model.reactions`.
         """
-        self._hold("hold", shell, vertices, components, motion=motion)
+        return self._hold("hold", shell, vertices, components, motion=motion, name=name)
 
     def clamp_boundary(
-        self, shell: int, vertices, components: str = "xyz", motion: Motion | Grip | None = None
-    ) -> None:
+        self, shell: int, vertices, components: str = "xyz", motion: Motion | Grip | None = None, name: str = ""
+    ) -> Handle:
         """Clamp a shell: fix components of vertices, and the normal at mesh edges between them, interior edges too.
 
         `motion` moves the components and rotates the normals as one body, also by more than one revolution. Other components stay
@@ -111,9 +114,9 @@ class Structures(Meridians, Magnets, Contacts):
         vertices = self._vertices(shell, vertices)
         surface = self.shells[shell].surface
         self._need_edges("clamp_boundary", shell, vertices, np.arange(len(surface.edges)), "mesh edge", "hold")
-        self._hold("clamp_boundary", shell, vertices, components, edges="clamp", motion=motion)
+        return self._hold("clamp_boundary", shell, vertices, components, edges="clamp", motion=motion, name=name)
 
-    def symmetry(self, shell: int, vertices, axis, motion: Motion | Grip | None = None) -> None:
+    def symmetry(self, shell: int, vertices, axis, motion: Motion | Grip | None = None, name: str = "") -> Handle:
         """Add a symmetry plane through boundary vertices, orthogonal to the surface.
 
         Args:
@@ -121,6 +124,7 @@ class Structures(Meridians, Magnets, Contacts):
             vertices: at the boundary, in one plane.
             axis: coordinate axis normal to the plane, "x", "y" or "z"; or the normal (3,), of any length (skew support).
             motion: translation of the plane along a coordinate axis.
+            name: of the support in `Model.reactions`.
 
         Raises:
             SceneError: vertices in no common plane or not at the boundary, or an unsupported motion of the plane.
@@ -147,16 +151,20 @@ class Structures(Meridians, Magnets, Contacts):
                 "symmetry: a moving plane is normal to a coordinate axis and does not rotate; give 'x', 'y' or 'z' and "
                 "Motion(translation=...)"
             )
-        self._hold("symmetry", shell, vertices, axis, edges="symmetry", normal=tuple(normal.tolist()), motion=motion)
+        options = {"edges": "symmetry", "normal": tuple(normal.tolist()), "motion": motion, "name": name}
+        return self._hold("symmetry", shell, vertices, axis, **options)
 
-    def add_vertex_force(self, shell: int, vertices, force, amplitude: Callable[[float], float] | None = None) -> None:
+    def add_vertex_force(
+        self, shell: int, vertices, force, amplitude: Callable[[float], float] | None = None
+    ) -> Handle:
         """Add a dead force [N] on each of some vertices, (3,) or (V, 3). In statics it grows with the load parameter."""
         vertices = argument_checks.once("add_vertex_force: vertices", self._vertices(shell, vertices))
         force = argument_checks.broadcast("add_vertex_force: force", force, (len(vertices), 3), own=1)
         amplitude = argument_checks.amplitude("add_vertex_force", amplitude)
         self.shell_loads.append(ShellLoad(shell, vertices, force, amplitude))
+        return Handle(len(self.shell_loads) - 1, "shell load")
 
-    def add_edge_force(self, shell: int, path, force, amplitude: Callable[[float], float] | None = None) -> None:
+    def add_edge_force(self, shell: int, path, force, amplitude: Callable[[float], float] | None = None) -> Handle:
         """Add a dead force per length (3,) [N/m] along mesh edges, half of each edge's force to either end.
 
         Args:
@@ -173,8 +181,9 @@ class Structures(Meridians, Magnets, Contacts):
         vertices = np.flatnonzero(length)
         amplitude = argument_checks.amplitude("add_edge_force", amplitude)
         self.shell_loads.append(ShellLoad(shell, vertices, length[vertices, None] * force, amplitude))
+        return Handle(len(self.shell_loads) - 1, "shell load")
 
-    def add_edge_couple(self, shell: int, path, couple, amplitude: Callable[[float], float] | None = None) -> None:
+    def add_edge_couple(self, shell: int, path, couple, amplitude: Callable[[float], float] | None = None) -> Handle:
         """Add a couple per length at rest [N] about boundary edges: a follower edge moment.
 
         Positive by the right hand about the edge with the surface to its left: a positive couple makes the surface convex on the side
@@ -206,10 +215,11 @@ class Structures(Meridians, Magnets, Contacts):
         self.edge_couples.append(
             EdgeCouple(shell, edges, couple, argument_checks.amplitude("add_edge_couple", amplitude))
         )
+        return Handle(len(self.edge_couples) - 1, "edge couple")
 
     def add_pressure(
         self, shell: int, pressure, triangles=None, *, dead: bool = False, amplitude: Callable | None = None
-    ) -> None:
+    ) -> Handle:
         """Add pressure [Pa] along the normals of triangles (all by default).
 
         Pressure is a follower load, without potential if the boundary moves. Statics uses its exact, unsymmetric load stiffness; in
@@ -231,6 +241,7 @@ class Structures(Meridians, Magnets, Contacts):
             argument_checks.amplitude("add_pressure", amplitude),
         )
         self.pressures.append(Pressure(shell, index, pressure, dead, amplitude))
+        return Handle(len(self.pressures) - 1, "pressure")
 
     def join(
         self, members: Iterable[tuple[int, int]], rigid: bool = True, laws: Mapping[str, Law] | None = None
@@ -291,7 +302,8 @@ class Structures(Meridians, Magnets, Contacts):
         glued = argument_checks.choice("attach: spin", spin, ("glued", "free")) == "glued"
         self.attachments.append(Attachment(int(rod), np.array(nodes), shell, vertices, glued))
 
-    def _hold(self, call: str, shell, vertices, components, **options) -> None:
+    def _hold(self, call: str, shell, vertices, components, *, name: str, **options) -> Handle:
+        name = name and argument_checks.text(f"{call}: name", name)
         if options.get("edges") != "symmetry":  # a skew support has no components
             argument_checks.components(call, components)
         motion, vertices = options.get("motion"), self._vertices(shell, vertices)
@@ -300,9 +312,11 @@ class Structures(Meridians, Magnets, Contacts):
             raise SceneError(
                 f"{call}: the motion has {motion.count} displacements of {len(vertices)} vertices; give one for each"
             )
-        self.shell_supports.append(ShellSupport(shell, vertices, components, call=call, **options))
+        self.shell_supports.append(ShellSupport(shell, vertices, components, call=call, name=name, **options))
+        return Handle(len(self.shell_supports) - 1, SHELL_SUPPORT, name)
 
     def _check_shell(self, shell) -> None:
+        need(SHELL, shell)
         if not 0 <= argument_checks.index("shell", shell) < len(self.shells):
             raise SceneError(f"shell {shell} does not exist; the scene has {len(self.shells)} shells so far")
 

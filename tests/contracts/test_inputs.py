@@ -15,6 +15,7 @@ import ddg_warp as ddg
 from ddg_warp.errors import SceneWarning
 from ddg_warp.geometry import meshes
 from ddg_warp.io.mesh_read import read_mesh
+from ddg_warp.scene.handle import Handle
 from ddg_warp.solve.equilibrium import statics
 from ddg_warp.solve.equilibrium.tangent import Tangent
 
@@ -335,7 +336,7 @@ def test_signatures_list_arguments():
         *("gravity", "dimension", "analysis", "mass_damping", "flow", "initial", "callbacks")
     ]
     assert {p.kind for p in inspect.signature(ddg.Scene).parameters.values()} == {inspect.Parameter.KEYWORD_ONLY}
-    assert typing.get_type_hints(ddg.Scene.add_rod)["return"] is int
+    assert typing.get_type_hints(ddg.Scene.add_rod)["return"] is Handle
 
 
 def test_repr_names_object_and_counts(device):

@@ -23,7 +23,15 @@ from ddg_warp import argument_checks
 from ddg_warp.capture_lock import launches, stays_here
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.model.state import State, check_state
-from ddg_warp.scene.equilibrium_path import BIFURCATION, LIMIT_POINT, Displacement, Path, Point, StopCriterion
+from ddg_warp.scene.equilibrium_path import (
+    BIFURCATION,
+    LIMIT_POINT,
+    Displacement,
+    Path,
+    Point,
+    StopCriterion,
+    watched_displacements,
+)
 from ddg_warp.solve.equilibrium.arc_length_corrector import ContinuationOptions, Corrector, Failed
 
 FORK = 1e-2  # Relative work of the load along the path below which a stationary load is no limit point.
@@ -40,25 +48,21 @@ class Continuation:
 
     Args:
         model: model with one world.
-        watch: displacements to record by name.
+        watch: displacements to record by name; (rod, node) under a name "d" gives "d.x", "d.y" and "d.z".
         options: see `ContinuationOptions`.
 
     Raises:
         SceneError: no supports, several worlds, or a watched point that does not exist.
     """
 
-    def __init__(self, model, watch: Mapping[str, Displacement] | None = None, **options):
-        if watch is not None and not isinstance(watch, Mapping):
-            raise SceneError(f"Continuation: watch is {argument_checks.shown(watch)}; give displacements by name")
-        for name, displacement in (watch or {}).items():
-            argument_checks.text("Continuation: a name in watch", name)
-            if not isinstance(displacement, Displacement):
-                raise SceneError(f"watch[{name!r}] is {displacement!r}; give Displacement.of(row, axis)")
+    def __init__(self, model, watch: Mapping[str, Displacement | tuple[int | str, int]] | None = None, **options):
+        planar = getattr(getattr(model, "scene", None), "dimension", 3) == 2
+        watch = watched_displacements("Continuation", {} if watch is None else watch, planar)
         self.model = model
         self.options = argument_checks.options(
             "Continuation", ContinuationOptions, options, argument_checks.names(Continuation)
         )
-        self.corrector = Corrector(model, watch or {}, self.options)
+        self.corrector = Corrector(model, watch, self.options)
         self.tangent, self.watched = self.corrector.tangent, self.corrector.watched
 
     def trace(
@@ -101,7 +105,8 @@ class Continuation:
         if stop is not None and not isinstance(stop, StopCriterion):
             raise SceneError(f"stop is {argument_checks.shown(stop)}; give StopCriterion(...)")
         if stop is not None and stop.displacement is not None and stop.displacement[0] not in self.watched:
-            raise SceneError(f"stop at {stop.displacement[0]!r}: it is not watched; there is {list(self.watched)}")
+            name = stop.displacement[0]
+            raise SceneError(f"stop at {name!r}: it is not watched{argument_checks.meant(name, self.watched)}")
         return stop or StopCriterion()
 
     def statistics(self, points: Sequence[Point]) -> dict:
@@ -185,7 +190,11 @@ class Continuation:
         """
         if not isinstance(displacement, str) or displacement not in self.watched:
             shown = argument_checks.shown(displacement)
-            raise SceneError(f"no displacement {shown} is watched; give watch={{{shown}: Displacement...}}")
+            if self.watched and isinstance(displacement, str):
+                raise SceneError(
+                    f"no displacement {shown} is watched{argument_checks.meant(displacement, self.watched)}"
+                )
+            raise SceneError(f"no displacement {shown} is watched; give watch={{{shown}: (rod, node)}}")
         row = np.append(self.watched[displacement], 0.0)
         values = np.atleast_1d(argument_checks.array("control: values", values, "give finite numbers"))
         if values.ndim != 1 or not values.size or not np.isfinite(values).all():

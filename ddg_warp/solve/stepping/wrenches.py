@@ -1,5 +1,6 @@
 """Wrenches of steps: force and moment at every support, grip and obstacle; see `kernels.residual.support_forces`."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -8,6 +9,7 @@ import warp as wp
 
 from ddg_warp import device_arrays
 from ddg_warp.compile.support_dofs import NormalMoments, SupportDofs, matches
+from ddg_warp.errors import SceneError
 from ddg_warp.kernels.collision.contact.obstacle_forces import obstacle_kernel, pairs_type
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.elements.coupled_element import coupled_storage
@@ -16,6 +18,7 @@ from ddg_warp.kernels.residual import support_forces
 from ddg_warp.kernels.residual.coupled_residual import inputs_type
 from ddg_warp.kernels.residual.support_forces import ROWS
 from ddg_warp.kernels.stepping import wrench_sums
+from ddg_warp.scene.handle import OBSTACLE, RING_SUPPORT, SHELL_SUPPORT, SUPPORT, Handle, named
 from ddg_warp.solve.linear.sparse_system import lists
 
 RUNS = 128  # sums of contact forces of each obstacle on a GPU
@@ -34,6 +37,38 @@ class Reaction:
     force: np.ndarray
     moment: np.ndarray
     point: np.ndarray
+
+
+class Reactions(list):
+    """Reactions of all supports, by position, by handle or by name.
+
+    Supports are ordered as added: of rods, then of shells, rings and obstacles.
+    """
+
+    def __init__(self, reactions: Iterable[Reaction], scene):
+        super().__init__(reactions)
+        of_kinds = (scene.supports, scene.shell_supports, scene.ring_supports, scene.obstacles)
+        self._first, self._names = {}, []
+        for kind, supports in zip((SUPPORT, SHELL_SUPPORT, RING_SUPPORT, OBSTACLE), of_kinds, strict=True):
+            self._first[kind] = len(self._names)
+            self._names += [support.name for support in supports]
+
+    def __getitem__(self, item):
+        """Return the reaction of a position, handle or name; of a slice a list.
+
+        Raises:
+            SceneError: no support or obstacle has the name, several have it, or the handle is of something else.
+        """
+        if isinstance(item, str):
+            item = int(named(SUPPORT, item, self._names))
+        elif isinstance(item, Handle):
+            if item.kind not in self._first:
+                raise SceneError(f"{item!r} is no support; give what clamp, fix, hold or add_obstacle returned")
+            item = self._first[item.kind] + item
+        return super().__getitem__(item)
+
+    def __reduce__(self):
+        return list, (list(self),)
 
 
 def support_count(scene) -> int:
