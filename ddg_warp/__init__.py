@@ -15,6 +15,8 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time see `_HOME`
     from ddg_warp import io
     from ddg_warp.errors import SceneError, SceneWarning, SolverError
     from ddg_warp.geometry import meshes
+    from ddg_warp.io import read as read_curves
+    from ddg_warp.io.mesh_read import read_mesh
     from ddg_warp.model import rest_shapes
     from ddg_warp.model.controls import Controls
     from ddg_warp.model.model import Model
@@ -23,6 +25,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time see `_HOME`
     from ddg_warp.run import bench
     from ddg_warp.run.check import Check
     from ddg_warp.run.recorder import Recorder
+    from ddg_warp.run.simulate import simulate
     from ddg_warp.scene.descriptions import Dynamics, PathAnalysis, Statics
     from ddg_warp.scene.drag import Granular, Viscous
     from ddg_warp.scene.equilibrium_path import Displacement, StopCriterion
@@ -36,6 +39,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time see `_HOME`
     from ddg_warp.solve.equilibrium import continuation, stability, statics
     from ddg_warp.solve.stepping.adaptive_step import AdaptiveStepper
     from ddg_warp.solve.stepping.integrator import Integrator
+    from ddg_warp.torch import Simulator
 
 __version__ = "0.2.0"
 __all__ = [
@@ -65,6 +69,7 @@ __all__ = [
     "Scene",
     "SceneError",
     "SceneWarning",
+    "Simulator",
     "SolverError",
     "Sphere",
     "State",
@@ -77,7 +82,10 @@ __all__ = [
     "io",
     "meshes",
     "quantities",
+    "read_curves",
+    "read_mesh",
     "rest_shapes",
+    "simulate",
     "stability",
     "statics",
 ]
@@ -116,6 +124,10 @@ _HOME = {
     "StopCriterion": "scene.equilibrium_path",
     "PathAnalysis": "scene.descriptions",
     "Viscous": "scene.drag",
+    "simulate": "run.simulate",
+    "read_curves": "io:read",
+    "read_mesh": "io.mesh_read",
+    "Simulator": "torch",
 }
 _MODULES = {
     "bench": "run.bench",
@@ -130,7 +142,8 @@ _MODULES = {
 
 def __getattr__(name: str):
     if name in _HOME:
-        return getattr(import_module(f"ddg_warp.{_HOME[name]}"), name)
+        module, _, original = _HOME[name].partition(":")
+        return getattr(import_module(f"ddg_warp.{module}"), original or name)
     module = f"ddg_warp.{_MODULES.get(name, name)}"
     try:
         return import_module(module)

@@ -205,14 +205,14 @@ def test_a_finished_run_is_left_as_it_is(fall, tmp_path, capsys):
 
 def test_a_run_killed_before_its_summary_gets_one(fall, tmp_path, monkeypatch):
     """All frames are complete: the resumed run is checked, summarised and drawn without a step."""
-    import ddg_warp.run.cli
+    import ddg_warp.run.outputs
 
     def killed(*_):
         raise KeyboardInterrupt
 
     assert fall("run", "--out", "straight") == 0
     with monkeypatch.context() as patch:
-        patch.setattr(ddg_warp.run.cli, "judged", killed)
+        patch.setattr(ddg_warp.run.outputs, "run_checks", killed)
         assert fall("run") == 130
     assert not (tmp_path / "out/fall/summary.json").exists()
     assert fall("run", "--resume", "out/fall") == 0
@@ -222,16 +222,16 @@ def test_a_run_killed_before_its_summary_gets_one(fall, tmp_path, monkeypatch):
 
 def test_run_is_locked_until_it_is_drawn(fall, tmp_path, monkeypatch, capsys):
     """A second run with --force during drawing is refused, and the first ends well."""
-    import ddg_warp.run.cli
+    import ddg_warp.run.outputs
 
-    draw, codes = ddg_warp.run.cli.draw, []
+    draw, codes = ddg_warp.run.outputs.draw, []
 
     def meanwhile(*arguments):
         if not codes:
             codes.append(fall("run", "--force", "--n", "5"))
         draw(*arguments)
 
-    monkeypatch.setattr(ddg_warp.run.cli, "draw", meanwhile)
+    monkeypatch.setattr(ddg_warp.run.outputs, "draw", meanwhile)
     assert fall("run") == 0
     assert codes == [2] and "is recording a run there; wait for its end" in capsys.readouterr().err
     assert points("out/fall").shape == (6, 4, 3) and summary()["parameters"]["n"] == 4
@@ -359,16 +359,16 @@ def test_a_check_that_fails_to_solve_fails_the_run(tmp_path, monkeypatch, capsys
 
 def test_progress_of_a_piped_run(fall, capsys, monkeypatch):
     """Piped stderr gets whole lines with steps, time and time left, at most one an interval; short runs print none."""
-    import ddg_warp.run.progress
+    import ddg_warp.progress
 
     assert fall("run") == 0
     assert "steps" not in capsys.readouterr().err
-    monkeypatch.setattr(ddg_warp.run.progress, "LINE_EVERY", 1e-9)
+    monkeypatch.setattr(ddg_warp.progress, "LINE_EVERY", 1e-9)
     assert fall("run", "--force") == 0
     lines = [line for line in capsys.readouterr().err.splitlines() if "steps" in line]
     assert 3 <= len(lines) <= 7
     assert lines[-1].startswith("5 of 5 steps, 00:0") and lines[-1].endswith("elapsed, 00:00 remaining")
-    monkeypatch.setattr(ddg_warp.run.progress, "LINE_EVERY", 1e9)
+    monkeypatch.setattr(ddg_warp.progress, "LINE_EVERY", 1e9)
     assert fall("run", "--force") == 0
     assert "steps" not in capsys.readouterr().err
 
@@ -382,7 +382,7 @@ def test_a_run_that_fails_before_its_first_state_says_so(failure, tmp_path, monk
     if failure == "first point":
         from ddg_warp.solve.equilibrium import continuation
 
-        def lost(self, state, stop):
+        def lost(self, state, stop, **_options):
             raise SolverError("no equilibrium", state=state)
 
         monkeypatch.setattr(continuation.Continuation, "trace", lost)

@@ -29,7 +29,7 @@ from ddg_warp.data.parameter_ranges import GROWING, KINDS, MOST, Range, check_ki
 from ddg_warp.errors import DataError, SceneError, SolverError
 from ddg_warp.io.paths import as_path
 from ddg_warp.postprocess.fields import check_fields
-from ddg_warp.run.progress import progress_bar
+from ddg_warp.progress import progress_bar
 from ddg_warp.run.run_directory import TRAJECTORY
 from ddg_warp.run.scene_registry import SHARED, load_scene, parameters, scene_name
 from ddg_warp.run.summary import plain, write_json

@@ -5,6 +5,7 @@ time relative to the scene's defaults, next to its error. `ddg_warp.run.bench_ov
 """
 
 import itertools
+import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -18,6 +19,7 @@ from ddg_warp.run.scene_registry import InputError, load_scene, parameters, scen
 from ddg_warp.run.simulate import Result, simulate
 from ddg_warp.scene.scene import Dynamics
 
+LOG = logging.getLogger("ddg_warp")
 RUN_SETTINGS = ("dt", "duration", "precision")
 SOLVER_OPTIONS = ("solver", "linear", "rtol", "unconverged_fraction")
 RESOLUTION = ("n", "cells", "segments", "rings", "around")  # names of the number of edges or cells in scenes
@@ -345,7 +347,7 @@ def plot(study: Study, rows: list[dict], path: Path, title: str, unit: str) -> N
     try:
         from ddg_warp.run.figure import error_plot
     except ModuleNotFoundError as error:
-        print(f"no plot without {error.name}: `pip install matplotlib`")
+        LOG.warning("no plot without %s: `pip install matplotlib`", error.name)
         return
     names = list(study.series or list(study.grid)[1:])
     label, across, up = " / ".join(names) or "scene", "time [s]", f"error [{unit}]" if unit else "error"

@@ -1,12 +1,14 @@
 """Overview of the benchmarks of many scenes: error and time of defaults, and time to each accuracy."""
 
 import json
+import logging
 from pathlib import Path
 
 import numpy as np
 
 from ddg_warp.run.scene_registry import scene_files
 
+LOG = logging.getLogger("ddg_warp")
 LEVELS = (1e-2, 1e-3, 1e-4)  # relative errors
 STEM = "overview"
 
@@ -58,7 +60,7 @@ def picture(rows: list[dict], path: Path) -> None:
     try:
         from ddg_warp.run.figure import levels_plot
     except ModuleNotFoundError as error:
-        print(f"no picture without {error.name}: `pip install matplotlib`")
+        LOG.warning("no picture without %s: `pip install matplotlib`", error.name)
         return
     names = [f"to_{100 * level:g}_percent" for level in LEVELS]
     marks = {f"{100 * level:g} %": [row[name] for row in rows] for level, name in zip(LEVELS, names, strict=True)}

@@ -76,7 +76,7 @@ def once_reached(result, t: float, names: Iterable[str], make: Callable[[], list
         names: Names of the checks.
         make: Returns the checks; not called if the run is shorter.
     """
-    if result.times and result.times[-1] >= t - 1e-3 * (result.dt or 1e-6):
+    if len(result.times) and result.times[-1] >= t - 1e-3 * (result.dt or 1e-6):
         return make()
     unit = "s" if result.dt else "of the load"
     return [Check.skip(name, f"needs {t:g} {unit}") for name in names]

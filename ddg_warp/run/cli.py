@@ -8,10 +8,9 @@ import json
 import os
 import shlex
 import sys
-from functools import partial
 from pathlib import Path
 
-from ddg_warp.run.run_directory import FULL, PICTURES, SUMMARY, RunDirectory, refuse_to_replace, system_error
+from ddg_warp.run.run_directory import FULL, SUMMARY, RunDirectory, refuse_to_replace, system_error
 from ddg_warp.run.scene_registry import (
     RUN_SETTINGS,
     InputError,
@@ -162,7 +161,7 @@ def run_scene(chosen: argparse.Namespace) -> int:
     require_device(chosen.device)
 
     from ddg_warp.run.simulate import simulate
-    from ddg_warp.run.summary import summary, write_json
+    from ddg_warp.run.summary import write_json
 
     directory = chosen.resume or chosen.out or Path("out") / name
     if chosen.resume is not None:
@@ -184,19 +183,14 @@ def run_scene(chosen: argparse.Namespace) -> int:
                 resume=run_directory if chosen.resume is not None else None,
                 force=chosen.force,
                 fields=[name for name in (chosen.fields or "").split(",") if name],
-                observe=getattr(module, "observe", None),
+                module=module,
                 provenance={"scene": name, "parameters": settings, "command": shlex.join(["ddg-warp", *sys.argv[1:]])},
                 **run_settings,
             )
-        checks = judged(module, result)
-        content = summary(name, settings, result, checks)
-        write_json(directory / SUMMARY, content)
-        if result.times:
-            draw(directory, module, result)
         if chosen.json is not None:
-            write_json(chosen.json, content)
-    say(result, content, checks, directory)
-    return FAILED if result.failure or any(check.failed for check in checks) else DONE
+            write_json(chosen.json, result.summary())
+    say(result, directory)
+    return FAILED if result.failure or any(check.failed for check in result.checks) else DONE
 
 
 def finished(directory: Path, duration: float | None) -> str:
@@ -233,20 +227,6 @@ def built(module, name: str, settings: dict):
             raise InputError(f"scene '{name}' cannot be built with {text} ({error}); change that") from error
 
 
-def judged(module, result) -> list:
-    """Return the checks of a scene; a solver failure in a check fails the run."""
-    from ddg_warp.errors import SolverError
-    from ddg_warp.solve.linear.sparse_direct import SingularError
-
-    if not hasattr(module, "check") or result.failure:
-        return []
-    try:
-        return module.check(result)
-    except (SolverError, SingularError) as error:
-        result.failure = f"a check could not be computed: {error}"
-        return []
-
-
 def settings_of(chosen: argparse.Namespace, module, name: str) -> tuple[dict, dict]:
     """Return scene parameters, and dt, precision and worlds if set by flags or the run to resume."""
     defaults = parameters(module, {})
@@ -264,10 +244,11 @@ def settings_of(chosen: argparse.Namespace, module, name: str) -> tuple[dict, di
     return parameters(module, settings | duration | shared), run_settings
 
 
-def say(result, content: dict, checks: list, directory: Path) -> None:
+def say(result, directory: Path) -> None:
     """Print report, counts, checks and failure of a run."""
     from ddg_warp.run.summary import checks_table, contact_line
 
+    content, checks = result.summary(), result.checks
     print(result.model.report(), end="\n\n")
     steps = f"{content['steps']} steps of {content['ms_per_step']:.3g} ms"
     print(
@@ -295,59 +276,6 @@ def say(result, content: dict, checks: list, directory: Path) -> None:
     print(f"results are in {directory}")
     if result.failure:
         print(f"ddg-warp: the solver failed: {result.failure}", file=sys.stderr)
-
-
-def draw(directory: Path, module, result, shapes: int = 6) -> None:
-    """Draw rods and surfaces of the first world at a few times into DIR/picture.png, if matplotlib is installed.
-
-    Statics and paths have the load parameter instead of the time. A path of equilibria is also drawn to DIR/path.png, load over
-    displacements. A scene may define
-
-    - `LENGTH_UNIT`;
-    - `picture(result, frames)`: arguments of `figure.rods_picture`, such as other `points_by_time`, instead of `frames`, the points
-      by time;
-    - `plot(result)`: arguments of `figure.lines_plot`, drawn to DIR/learned.png if its check has set `result.learned`.
-    """
-    try:
-        from ddg_warp.run.figure import lines_plot, path_plot, rods_picture
-    except ModuleNotFoundError as error:
-        print(f"no picture without {error.name}: `pip install matplotlib`", file=sys.stderr)
-        return
-    from ddg_warp.io.hdf5 import TrajectoryReader
-
-    for path in (directory / name for name in PICTURES):
-        if path.is_symlink():
-            path.unlink()  # its target is not of this run
-    title, unit = one_liner(Path(module.__file__)), getattr(module, "LENGTH_UNIT", "m")
-    with TrajectoryReader(directory / "trajectory.h5") as reader:
-        chosen = sorted({round((len(reader) - 1) * k / (shapes - 1)) for k in range(shapes)})
-        count = reader.points.shape[-2]
-        abscissa = reader.series["load"] if result.path is not None else reader.time
-        frames = [(float(abscissa[frame]), reader.points[frame].reshape(-1, 3)[:count]) for frame in chosen]
-        options = {"points_by_time": frames, "unit": unit}
-        if result.dt is None:
-            options["label"] = "load parameter"
-        if (applied := result.scene.applied_field) is not None:
-            last = frames[-1][0]
-            options["field"] = partial(applied.over, t=last, otherwise=last if result.dt is None else 1.0)
-        if reader.obstacles is not None:
-            options["bodies"] = standing(reader, {frame: float(abscissa[frame]) for frame in chosen})
-        if hasattr(module, "picture") and not result.failure:
-            options |= module.picture(result, dict(frames))
-        rods_picture(reader, path=directory / "picture.png", title=title, **options)
-    if result.path is not None:
-        path_plot(result.path, directory / "path.png", title, unit)
-    if result.learned is not None:
-        lines_plot(directory / "learned.png", **module.plot(result))
-
-
-def standing(reader, times: dict[int, float]) -> dict[float, tuple]:
-    """Return obstacles of the first world as surfaces by time; fixed ones only at the first time."""
-    obstacles, nodes, shown = reader.obstacles, reader.obstacle_points, {}
-    for frame, time in times.items():
-        moved = None if nodes is None else nodes[frame].reshape(-1, *nodes.shape[-2:])[0]
-        shown[time] = obstacles.surface(moved, obstacles.moved | (not shown))
-    return shown
 
 
 def list_all(chosen: argparse.Namespace) -> int:

@@ -16,7 +16,9 @@ import numpy as np
 from ddg_warp import argument_checks
 from ddg_warp.errors import SolverError
 from ddg_warp.io.observed import checked_observed
-from ddg_warp.run.progress import progress_bar
+from ddg_warp.progress import Heartbeat, progress_bar
+from ddg_warp.run.check import Check
+from ddg_warp.run.run_directory import SUMMARY
 from ddg_warp.run.scene_registry import RUN_SETTINGS, InputError
 from ddg_warp.scene.descriptions import Dynamics, Statics
 from ddg_warp.scene.scene import Scene
@@ -34,8 +36,9 @@ class Result:
         scene: The scene.
         model: The model.
         state: The last good state.
-        times: Time of each recorded state [s], the initial one first. In statics the load parameter, along a path the arc length.
-        series: Observed values by name, one a recorded state.
+        times: Time of each recorded state [s] (states,), the initial one first. In statics the load parameter, along a path the arc
+            length.
+        series: Observed values by name, arrays (states,), or (states, ...) of several numbers each.
         statistics: `integrator.statistics()`, or the like of a static run.
         energies: Energies by term [J] at "start" and "end"; None at the start if `counted_from` is set.
         dt: Time step [s]; None in statics.
@@ -49,13 +52,15 @@ class Result:
         choice: Step and rtol (`ddg_warp.run.step_choice.StepChoice`) chosen for `Dynamics(error=...)`; None without. The `step_times`
             are then times of all steps within dt.
         learned: Data that the scene's check learned from the run, for its plot; None without.
+        checks: Checks of the run (`Check`), if a check was given.
+        name, parameters: Name of the scene and parameters of its `build`, from the provenance.
     """
 
     scene: Scene
     model: Any
     state: Any
-    times: list[float] = field(default_factory=list)
-    series: dict[str, list[float]] = field(default_factory=dict)
+    times: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    series: dict[str, np.ndarray] = field(default_factory=dict)
     statistics: dict = field(default_factory=dict)
     energies: dict[str, dict[str, float]] = field(default_factory=dict)
     dt: float | None = None
@@ -68,9 +73,12 @@ class Result:
     path: Any = None
     choice: Any = None
     learned: Any = None
+    checks: list[Check] = field(default_factory=list)
+    name: str = "scene"
+    parameters: dict = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        reached = f"{self.times[0]:g} to {self.times[-1]:g}" if self.times else "none"
+        reached = f"{self.times[0]:g} to {self.times[-1]:g}" if len(self.times) else "none"
         names = ", ".join(self.series) or "nothing"
         ended = f"; failed: {self.failure}" if self.failure else ""
         return f"<Result: {len(self.times)} states, times {reached}, observed {names}, {self.wall_time:.3g} s of wall time{ended}>"
@@ -84,6 +92,34 @@ class Result:
         """Mean time of a step [s], if possible without the first two, which compile and capture."""
         steady = self.step_times[2:] or self.step_times
         return sum(steady) / len(steady) if steady else 0.0
+
+    def summary(self) -> dict[str, Any]:
+        """Return the content of summary.json; see `ddg_warp.run.summary`."""
+        from ddg_warp.run.summary import summary
+
+        return summary(self.name, self.parameters, self, self.checks)
+
+    def to_pandas(self):
+        """Return the series as a `pandas.DataFrame`, a row a recorded state; several numbers a state are columns "name.0", ...
+
+        Its index is the time [s], in statics the load parameter, along a path the arc length.
+
+        Raises:
+            ModuleNotFoundError: pandas is not installed.
+        """
+        try:
+            import pandas as pd
+        except ModuleNotFoundError:
+            raise ModuleNotFoundError(
+                "to_pandas needs pandas, which is not installed: `pip install pandas`; or take `result.series`, arrays by name"
+            ) from None
+        columns = {}
+        for name, values in self.series.items():
+            flat = np.asarray(values).reshape(len(self.times), -1)
+            names = [name] if np.ndim(values) == 1 else [f"{name}.{i}" for i in range(flat.shape[1])]
+            columns |= dict(zip(names, flat.T, strict=True))
+        axis = "arc length" if self.path is not None else "load parameter" if self.dt is None else "time"
+        return pd.DataFrame(columns, index=pd.Index(self.times, name=axis))
 
     def at(self, t: float, name: str) -> float:
         """Return the observed value `name` at time t [s], to a thousandth of a step.
@@ -101,9 +137,9 @@ class Result:
         return self._index(t) is not None
 
     def _index(self, t: float) -> int | None:
-        if not self.times:
+        if not len(self.times):
             return None
-        nearest = min(range(len(self.times)), key=lambda i: abs(self.times[i] - t))
+        nearest = int(np.argmin(np.abs(np.asarray(self.times) - t)))
         return nearest if abs(self.times[nearest] - t) <= 1e-3 * (self.dt or 1e-6) else None
 
 
@@ -121,19 +157,22 @@ def simulate(
     fields: Sequence[str] = (),
     usd: bool = True,
     observe: Callable[[Any, Any], Mapping[str, float]] | None = None,
+    check: Callable[[Result], Sequence[Check]] | None = None,
+    module: Any = None,
+    picture: bool = True,
     provenance: Mapping | None = None,
     options: Mapping | None = None,
     clock: Callable[[], float] | None = None,
     progress: bool = True,
 ) -> Result:
-    """Run the analysis of a scene.
+    """Run the analysis of a scene, as `ddg-warp run` does: record, check, and draw.
 
     Args:
         scene: The scene.
         device: Warp device; by default CUDA if there is one.
         precision: "float64", "mixed" or "float32"; by default the scene's, else by device.
         worlds: Independent copies.
-        out: Directory for trajectory.h5 and scene.usdc, or a `RunDirectory`; None records nothing.
+        out: Directory for trajectory.h5, scene.usdc, summary.json and picture.png, or a `RunDirectory`; None records nothing.
         dt: Time step [s] instead of the scene's.
         duration: End of the run [s] instead of the scene's or the resumed run's.
         resume: Directory of an earlier run to continue, with its time step, precision, worlds and fields. A finished run is not
@@ -143,6 +182,9 @@ def simulate(
             `ddg_warp.postprocess.fields`.
         usd: Whether to record scene.usdc, too.
         observe: (model, state) -> values by name, taken at the start and after every step.
+        check: Function of the result that returns its checks (`Check`), called at the end.
+        module: Module with `observe`, `check`, and options of pictures, as a scene file has them; see `run.outputs.draw`.
+        picture: Whether to draw picture.png into `out`, if matplotlib is installed.
         provenance: Attributes of the trajectory: scene, parameters, command.
         options: Keyword arguments of the `Integrator` or of `StaticsOptions`: rtol, instead of the scene's, and others.
         clock: Clock of `step_times` [s]; by default wall time, synchronised on CUDA.
@@ -157,13 +199,14 @@ def simulate(
             other settings or is longer.
     """
     began = time.perf_counter()
+    observe, check = observe or getattr(module, "observe", None), check or getattr(module, "check", None)
     if not isinstance(scene, Scene):
         raise InputError(f"the scene is {type(scene).__name__}; `build` returns a Scene")
     _check(
         worlds,
         fields,
-        flags={"force": force, "usd": usd, "progress": progress},
-        functions={"observe": observe, "clock": clock},
+        flags={"force": force, "usd": usd, "progress": progress, "picture": picture},
+        functions={"observe": observe, "check": check, "clock": clock},
         mappings={"provenance": provenance, "options": options},
         paths={"out": out, "resume": resume},
     )
@@ -192,12 +235,15 @@ def simulate(
         run, steps = follow, analysis.stop.steps
 
     model = scene.build(device=device, precision=precision, worlds=worlds)
-    result = Result(scene, model, model.state(), dt=dt)
+    about = provenance or {}
+    result = Result(scene, model, model.state(), dt=dt, name=about.get("scene", "scene"), times=[])
+    result.parameters = dict(about.get("parameters", {}))
     if scene.initial:
         try:
             result.state = scene.initial(model)  # may set parameters, hence also in a resumed run
         except SolverError as error:
             result.fail(error, "the first state could not be found: ")
+            _finish(result, None, out, module, False)
             return result
     counts = continue_from(result, Path(resume), duration) if resume is not None else {}
     done = max(0, len(result.times) - 1)
@@ -243,7 +289,7 @@ def simulate(
                 result.compile_time = time.perf_counter() - began
                 bar.set_description(refresh=False)
             values = dict(observed or {}) | checked_observed(None if observe is None else observe(model, state))
-            values = checked_observed(values, result.series.keys() if result.times else None)
+            values = checked_observed(values, result.series.keys() if len(result.times) else None)
             result.state = state
             result.times.append(float(state.time))
             for name, value in values.items():
@@ -259,7 +305,25 @@ def simulate(
             result.state = error.state if error.state is not None else result.state
     result.wall_time, result.compile_time = clocks().values()
     result.energies["end"] = energies(model, result.state)
+    directory = out if out is not None else resume
+    if resume is not None and done >= steps and (Path(resume) / SUMMARY).exists():
+        directory = None  # a finished run stays as it is
+    _finish(result, check, directory, module, picture)
     return result
+
+
+def _finish(result: Result, check: Callable | None, directory, module, picture: bool) -> None:
+    """Convert the series to arrays, run the checks, and write summary and pictures to a directory, if any."""
+    from ddg_warp.run.outputs import draw, run_checks
+    from ddg_warp.run.summary import write_json
+
+    result.times = np.array(result.times, float)
+    result.series = {name: np.array(values) for name, values in result.series.items()}
+    result.checks = run_checks(check, result)
+    if directory is not None:
+        write_json(Path(directory) / SUMMARY, result.summary())
+        if picture and len(result.times):
+            draw(Path(directory), module, result)
 
 
 def _check(worlds, fields, *, flags: Mapping, functions: Mapping, mappings: Mapping, paths: Mapping) -> None:
@@ -318,7 +382,7 @@ def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clo
     substeps = 2**result.choice.halvings if result.choice else 1
     integrator = Integrator(result.model, **settings | options)
     counted = partial(counts_of, integrator)
-    if not result.times:
+    if not len(result.times):
         keep(result.state, counts=counted)
     state = repeat(integrator, result.state, result.dt, counts) if counts else result.state
     try:
@@ -336,7 +400,7 @@ def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clo
 
 def equilibrate(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar) -> None:
     """Solve all load steps and `keep` each equilibrium."""
-    from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions
+    from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions, progress_of
 
     keep(result.state)
     equilibrium = Equilibrium(result.model, StaticsOptions(**options))
@@ -344,7 +408,8 @@ def equilibrate(result: Result, steps: int, keep: Callable, *, options: Mapping,
     try:
         for step in range(steps):
             started, before = clock(), equilibrium.iterations
-            state = equilibrium.load(state, 1, step / steps, (step + 1) / steps)
+            with Heartbeat("statics", partial(progress_of, equilibrium), not bar.disable):
+                state = equilibrium.load(state, 1, step / steps, (step + 1) / steps)
             result.step_times.append(clock() - started)
             iterations.append(equilibrium.iterations - before)
             outcomes[equilibrium.outcome] += 1
@@ -368,7 +433,7 @@ def follow(result: Result, steps: int, keep: Callable, *, options: Mapping, cloc
     settings = {name: getattr(analysis, name) for name in ("step", "max_step", "load_scale")}
     try:
         continuation = Continuation(result.model, analysis.watch, **{**settings, **options})
-        result.path = continuation.trace(result.state, stop=analysis.stop)
+        result.path = continuation.trace(result.state, stop=analysis.stop, progress=not bar.disable)
     except SolverError as error:
         result.path = getattr(error, "path", None)
         raise

@@ -10,7 +10,8 @@ import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader
 from ddg_warp.io.usd_check import validate
-from ddg_warp.run.cli import main, standing
+from ddg_warp.run.cli import main
+from ddg_warp.run.outputs import standing
 
 MOTION = ddg.Motion(translation=lambda t: (0.0, 0.5 * t, 0.0), angle=lambda t: 3.0 * t, axis=(1.0, 0.0, 0.5))
 DT, RADIUS = 0.01, 2e-3

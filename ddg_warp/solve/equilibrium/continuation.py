@@ -23,6 +23,7 @@ from ddg_warp import argument_checks
 from ddg_warp.capture_lock import launches, stays_here
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.model.state import State, check_state
+from ddg_warp.progress import Heartbeat
 from ddg_warp.scene.equilibrium_path import (
     BIFURCATION,
     LIMIT_POINT,
@@ -72,6 +73,7 @@ class Continuation:
         start: float = 0.0,
         direction: int = 1,
         stop: StopCriterion | None = None,
+        progress: bool = True,
     ) -> Path:
         """Follow the path by arc length.
 
@@ -80,6 +82,7 @@ class Continuation:
             start: initial load parameter.
             direction: +1 with initially growing load, -1 with falling load.
             stop: end of the path.
+            progress: whether a path of more than ten seconds reports its progress on stderr.
 
         Raises:
             SolverError: `no_start`, `singular_start` or `step_too_small`; carries the last good state, and the path so far as `path`.
@@ -92,7 +95,9 @@ class Continuation:
         stop = self._stop(stop)
         if direction * first.direction[-1] < 0.0:
             first.direction = -first.direction
-        return self._follow(Path([first]), stop)
+        path = Path([first])
+        with Heartbeat("path", lambda: _progress(path, stop), argument_checks.flag("trace: progress", progress)):
+            return self._follow(path, stop)
 
     def _start(self, state: State | None, start: float) -> Point:
         """Return the first point of a path, near `state`."""
@@ -396,3 +401,15 @@ class Continuation:
         )
         error.path = path
         return error
+
+
+def _progress(path: Path, stop: StopCriterion) -> tuple[float, str]:
+    """Return the fraction of the most advanced bound of a path, and a text with points and load."""
+    point, bounds = path.points[-1], [((path.points[0].load, path.points[-1].load), stop.load)]
+    if stop.displacement is not None:
+        name, *limits = stop.displacement
+        bounds.append(((path.points[0].values[name], point.values[name]), limits))
+    parts = [len(path.points) / stop.steps]
+    for (first, last), limits in bounds:
+        parts += [(last - first) / (limit - first) for limit in limits if np.isfinite(limit) and limit != first]
+    return min(1.0, max(parts)), f"{len(path.points)} points, load parameter {point.load:.4g}"

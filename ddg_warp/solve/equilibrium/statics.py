@@ -17,6 +17,7 @@ Every equilibrium has its outcome (`State.outcome`), the fraction of the loads n
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from ddg_warp.model import validate
 from ddg_warp.model.controls import Controls, checked
 from ddg_warp.model.model import check_model
 from ddg_warp.model.state import State, check_state
+from ddg_warp.progress import Heartbeat
 from ddg_warp.scene import validate as scene_validate
 from ddg_warp.solve.equilibrium import mixed_newton, remedies, stability
 from ddg_warp.solve.equilibrium.newton_direct import DirectNewton
@@ -95,6 +97,7 @@ def solve(
     end: float = 1.0,
     way: list[State] | None = None,
     rest: Mapping | None = None,
+    progress: bool = True,
     **options,
 ) -> State:
     """Return the equilibrium at load parameter `end`, reached from `start` in at least `load_steps` increments.
@@ -113,6 +116,7 @@ def solve(
         rest: rest shapes at `end`, by shell or rod, index or name, such as {0: dict(metric=..., curvature=...)}. They change in
             proportion to the load parameter, so that load steps and halving act on growth; see
             `ddg_warp.solve.equilibrium.rest_path.RestPath`. The model keeps the rest shapes of the last equilibrium.
+        progress: whether a solve of more than ten seconds reports its progress on stderr.
         options: see `StaticsOptions`.
 
     Returns:
@@ -133,7 +137,15 @@ def solve(
         check_state("statics", model, state)
     options = argument_checks.options("statics.solve", StaticsOptions, options, argument_checks.names(solve))
     equilibrium = Equilibrium(model, options)
-    return equilibrium.load(state or model.state(), load_steps, start, end, controls, way, rest)
+    with Heartbeat("statics", partial(progress_of, equilibrium), argument_checks.flag("statics: progress", progress)):
+        return equilibrium.load(state or model.state(), load_steps, start, end, controls, way, rest)
+
+
+def progress_of(equilibrium: "Equilibrium") -> tuple[float, str]:
+    """Return the solved fraction of a load stepping, and a text with load parameter and iterations; takes no lock."""
+    start, current, end = equilibrium.reached
+    text = f"load parameter {current:g} of {end:g}, {equilibrium.iterations} Newton iterations"
+    return (current - start) / (end - start) if end != start else 0.0, text
 
 
 @stays_here
@@ -148,6 +160,7 @@ class Equilibrium:
         factors: True if the tangent at equilibria is factorised, to test stability.
         mixed: True to try mixed Newton first; by default if applicable.
         iterations: Newton iterations so far.
+        reached: start, current value and end of the load parameter in `load`.
         outcome: outcome of the last solve, `converged` or `converged_to_rounding`.
         stiffness: tangent at the last equilibrium (size, size), None without `factors`.
     """
@@ -170,6 +183,7 @@ class Equilibrium:
         self.descent = DirectNewton(self)
         self.iterations = 0
         self.outcome, self.stiffness = "", None
+        self.reached = 0.0, 0.0, 1.0  # start, current and final load parameter of `load`
         self._fields = _fields_between(model, {}, 0.0, 1.0)
 
     @property
@@ -227,6 +241,7 @@ class Equilibrium:
                 f"contact: friction needs an increment of the load parameter, and from {start:g} to {end:g} "
                 "there is none; give start other than end, or friction=0"
             )
+        self.reached = start, start, end
         inputs = checked(controls, self.model, "statics")
         if self.coupled and self.coupled.newton.outdated:
             self.coupled = CoupledEquilibrium(self)
@@ -266,6 +281,7 @@ class Equilibrium:
                 if way is not None:
                     way.append(state)
                 current, cuts = target, max(0, cuts - 1)  # a larger increment may succeed again
+                self.reached = start, current, end
             except SolverError as error:
                 shapes.to((current - start) / (end - start))
                 if error.outcome == "lost_in_rounding" and (advice := jump_between(self.model, current, target)):

@@ -1,5 +1,7 @@
 """Time integration on the device: implicit Euler and implicit midpoint rule, with retries."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import warp as wp
 
@@ -180,6 +182,35 @@ class Integrator:
         for callback in self.model.scene.callbacks:
             callback(target)
         return target
+
+    def run(
+        self, duration: float, dt: float, state: State | None = None, controls: Controls | None = None
+    ) -> Iterator[State]:
+        """Yield the state after every step of dt [s] for `duration` [s].
+
+        Args:
+            duration: whole number of steps [s]; dt: step length [s].
+            state: start of the first step; the rest state by default.
+            controls: see `step`; the same in every step.
+
+        Raises:
+            SceneError: the duration is no whole number of steps.
+            SolverError: see `step`; the last step is checked, too.
+        """
+        dt = argument_checks.positive("run: dt", dt, "s")
+        duration = argument_checks.positive("run: duration", duration, "s")
+        steps = round(duration / dt)
+        if steps < 1 or abs(steps * dt - duration) > 1e-6 * dt:
+            raise SceneError(f"run: a duration of {duration:g} s is no whole number of steps of {dt:g} s; change one")
+        state = self.model.state() if state is None else state
+        check_state("run", self.model, state)
+        return self._run(state, steps, dt, controls)
+
+    def _run(self, state: State, steps: int, dt: float, controls: Controls | None) -> Iterator[State]:
+        for _ in range(steps):
+            state = self.step(state, dt, controls)
+            yield state
+        self.check(state)
 
     def _begin(self, source: int) -> None:
         """Launch the preparation of a step from an outside state in a buffer."""
