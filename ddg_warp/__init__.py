@@ -4,6 +4,16 @@
     model = scene.build(); integrator = Integrator(model); state = model.state()
     for _ in range(100): state = integrator.step(state, dt=0.01)
 
+Describe a scene: `Scene`, `Circle`, `Ellipse`, `Rectangle`, `Ribbon`, `Stiffness`, `Material`, `Law`.
+Supports, motions, controls: `Motion`, `Grip`, `Controls`, `Samples`.
+Obstacles, fluid: `Plane`, `Sphere`, `Capsule`, `Box`, `Mesh`, `Viscous`, `Granular`.
+Run it: `simulate`, `Dynamics`, `Statics`, `PathAnalysis`, `StopCriterion`, `Displacement`, `Check`, `Recorder`, `bench`.
+Loops: `Integrator`, `AdaptiveStepper`, `statics`, `continuation`, `stability`.
+Query it: `Model`, `State`, `quantities`.
+Geometry, files: `meshes`, `rest_shapes`, `io`, `read_mesh`, `read_curves`.
+Learn: `Simulator` (torch), `ddg_warp.torch`, `ddg_warp.data`, `ddg_warp.rl`.
+Errors: `SceneError`, `SolverError`, `SceneWarning`.
+
 Names are loaded on first use, so importing the package loads neither Warp nor other heavy modules. Warp is silent about its modules
 unless DDG_WARP_VERBOSE=1 is set.
 """
@@ -143,14 +153,24 @@ _MODULES = {
 def __getattr__(name: str):
     if name in _HOME:
         module, _, original = _HOME[name].partition(":")
-        return getattr(import_module(f"ddg_warp.{module}"), original or name)
+        try:
+            return getattr(import_module(f"ddg_warp.{module}"), original or name)
+        except ModuleNotFoundError as error:
+            if error.name not in ("ddg_warp.kernels", "ddg_warp.scenes", "warp", "numpy", "scipy"):
+                raise
+            raise ModuleNotFoundError(
+                f"{error.name} is missing: install the package with `pip install -e .` in the folder of its pyproject.toml",
+                name=error.name,
+            ) from error
     module = f"ddg_warp.{_MODULES.get(name, name)}"
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
         if error.name != module:
             raise
-        raise AttributeError(f"ddg_warp has no attribute {name!r}; dir(ddg_warp) lists what it has") from None
+        from ddg_warp.argument_checks import meant
+
+        raise AttributeError(f"ddg_warp has no attribute {name!r}{meant(name, __all__)}") from None
 
 
 def __dir__() -> list[str]:

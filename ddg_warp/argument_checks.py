@@ -191,12 +191,18 @@ def names(call: Callable) -> list[str]:
     return [each.name for each in listed if each.kind is not each.VAR_KEYWORD]
 
 
+def nearest(name, valid: Iterable[str]) -> str:
+    """Return "; did you mean 'x'?" for the nearest valid name, or ""."""
+    near = difflib.get_close_matches(name, sorted(valid), 1) if isinstance(name, str) else []
+    return f"; did you mean {near[0]!r}?" if near else ""
+
+
 def meant(name: str, valid: Iterable[str]) -> str:
     """Return the end of a message on an unknown name: the nearest valid name, and all valid names."""
     valid = sorted(valid)
-    near = difflib.get_close_matches(name, valid, 1)
+    near = nearest(name, valid)
     listing = f"here {'is' if len(valid) == 1 else 'are'} {', '.join(valid)}"
-    return f"; did you mean {near[0]!r}? T{listing}" if near else f"; t{listing}"
+    return f"{near} T{listing}" if near else f"; t{listing}"
 
 
 def called(kind: type) -> type:

@@ -195,11 +195,11 @@ class Model:
         """Return the handle of an obstacle from a name or index."""
         return self.order.handle(OBSTACLE, item)
 
-    def report(self) -> str:
-        """Return a text: content of the model, cost, and omissions."""
+    def report(self, absent: bool = False) -> str:
+        """Return a text: content and cost of the model; with `absent` also the terms that it has not."""
         from ddg_warp.postprocess.model_report import report
 
-        return report(self)
+        return report(self, argument_checks.flag("report: absent", absent))
 
     @one_at_a_time
     def energies(self, state: State) -> dict[str, float]:
@@ -311,11 +311,15 @@ class Model:
         terms = self._terms()
         if not isinstance(term, str) or term not in terms:
             raise ValueError(
-                f"set_parameter: no rod or shell has the term {term!r}; this model has {', '.join(sorted(terms))}"
+                f"set_parameter: no rod or shell has the term {term!r}{argument_checks.nearest(term, terms) or ';'} this model has "
+                f"{', '.join(sorted(terms))}"
             )
         rules = terms[term]
         if not isinstance(parameter, str) or parameter not in rules:
-            raise ValueError(f"set_parameter: {term} has no parameter {parameter!r}; it has {', '.join(rules)}")
+            near = argument_checks.nearest(parameter, rules)
+            raise ValueError(
+                f"set_parameter: {term} has no parameter {parameter!r}{near or ';'} it has {', '.join(rules)}"
+            )
         return rules[parameter].valid
 
     def _terms(self) -> dict[str, dict]:

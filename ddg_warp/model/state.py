@@ -11,6 +11,7 @@ from ddg_warp import device_arrays as arrays
 from ddg_warp.capture_lock import launches
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import polyline
+from ddg_warp.scene.descriptions import Dynamics
 from ddg_warp.scene.handle import OBSTACLE, Handle
 
 EQUILIBRIUM = ("stable", "outcome", "unbalanced", "sliding")  # set by static solvers
@@ -149,7 +150,9 @@ class State:
 
     def __repr__(self) -> str:
         model = self.model
-        return f"<State at t = {self.time:g} s: {model.worlds} worlds of {model.points_count} points on {model.device}>"
+        static = self.outcome is not None or not isinstance(model.scene.analysis, Dynamics)
+        reached = f"load parameter {self.time:g}" if static else f"t = {self.time:g} s"
+        return f"<State at {reached}: {model.worlds} worlds of {model.points_count} points on {model.device}>"
 
     def parts(self) -> dict:
         """Return the states of rod groups, the coupled system and grips, by name."""

@@ -25,8 +25,12 @@ SOLVERS = {
 CLOSED = "block LDL^T with a Schur complement (closed rods), one Newton loop a rod"
 
 
-def report(model) -> str:
-    """Return a summary of the model in a few lines of text; a test compares it with kernel launches."""
+def report(model, absent: bool = False) -> str:
+    """Return a summary of the model in a few lines of text; a test compares it with kernel launches.
+
+    Args:
+        model: the model; absent: whether to list the terms that it has not, too.
+    """
     rods, nodes = model.scene.rod_count, int(model.curves.counts.sum())
     lines = [f"{rods} rods, {nodes} nodes, worlds {model.worlds}, {model.precision} on {model.device}"]
     present = set()
@@ -61,8 +65,9 @@ def report(model) -> str:
     bare = dict.fromkeys(batch.name for batch in model.scene.batches if batch.section.radius is None)
     if bare:
         lines.append(f"drawn {2.0 * DRAWN:g} m thick, as their section has no radius: {', '.join(bare)}")
-    absent = sorted({term.name for term in ALL.values()} - present)
-    lines.append("not in this scene: " + ", ".join(absent))
+    if not absent:
+        return "\n".join(lines)
+    lines.append("not in this scene: " + ", ".join(sorted({term.name for term in ALL.values()} - present)))
     if not any(group.kind.twist for group in model.groups) and (model.coupled is None or not model.coupled.edges):
         lines.append("no angles, no frames, no rotary inertia")
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""The command line: `ddg-warp run | sweep | list | check | gradients | bench | export | info`.
+"""The command line: `ddg-warp run | sweep | list | check | gradients | bench | export | warmup | info`.
 
 Exit codes: 0 done, 1 a check or the solver failed, 2 invalid input, 130 interrupted, 141 broken pipe.
 """
@@ -140,6 +140,10 @@ def parser(arguments: list[str]) -> Parser:
     export.add_argument(
         "--revolve", type=int, default=0, metavar="N", help="convert meridians to surfaces of revolution of N sides"
     )
+
+    warmup = commands.add_parser("warmup", help="compile the usual kernels once, so that first runs start at once")
+    warmup.set_defaults(command=compile_kernels)
+    warmup.add_argument("--device", help="Warp device, such as cpu or cuda:0 (default: CUDA if there is one)")
 
     info = commands.add_parser("info", help="show versions, devices and machine")
     info.set_defaults(command=show_info)
@@ -356,6 +360,16 @@ def export_run(chosen: argparse.Namespace) -> int:
     with refused():
         export_usd(source, target, tube=chosen.tube, revolve=chosen.revolve)
     print(f"wrote {target}")
+    return DONE
+
+
+def compile_kernels(chosen: argparse.Namespace) -> int:
+    """Compile the kernels of usual scenes into the cache."""
+    from ddg_warp.run.warmup import warm_up
+
+    require_device(chosen.device)
+    for name, seconds in warm_up(chosen.device):
+        print(f"{name}: {seconds:.3g} s", flush=True)
     return DONE
 
 

@@ -82,17 +82,23 @@ class Mesh:
     """Triangle mesh with contact on both sides, open or closed.
 
     Attributes:
-        points: vertices (P, 3) [m]; cells: corners of the triangles (T, 3), as `io.read_mesh` gives both.
+        points: vertices (P, 3) [m]; or the result of `read_mesh`, instead of points and cells.
+        cells: corners of the triangles (T, 3).
         radius: half the thickness of the surface [m].
     """
 
     points: np.ndarray
-    cells: np.ndarray
+    cells: np.ndarray | None = None
     radius: float = 0.0
 
     kind = MESH
 
     def __post_init__(self):
+        if isinstance(self.points, tuple) and len(self.points) == 3 and isinstance(self.points[2], str):
+            for name, value in zip(("points", "cells"), self.points[:2], strict=True):
+                object.__setattr__(self, name, value)
+        if self.cells is None:
+            raise SceneError("Mesh: there are no triangles; give points and cells, or what read_mesh returns")
         points = argument_checks.array("Mesh: points", self.points, "give (points, 3) [m]").copy()
         cells = argument_checks.triangles("Mesh: triangles", self.cells)
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():

@@ -33,7 +33,7 @@ class ParameterTensors:
             SceneError: nothing has it.
         """
         if not isinstance(name, str):
-            raise SceneError(f"parameters: {name!r} is no name; this model has {', '.join(self.names())}")
+            raise SceneError(f"parameters: {name!r} is no name; this model has {', '.join(self.names())}{near}")
         if name not in self._found:
             if name in user_force_parameters.names(self.model):
                 storage = user_force_parameters.array_views(self.model, name)
@@ -46,6 +46,7 @@ class ParameterTensors:
                     f"parameters: {name} is prescribed by a field of the scene; give controls={{'fields': {{name: tensor}}}}"
                 )
             if not storage[1]:
+                near = argument_checks.nearest(name, self.names())
                 raise SceneError(f"parameters: no object has {name!r}; this model has {', '.join(self.names())}")
             self._found[name] = storage
         return self._found[name]
