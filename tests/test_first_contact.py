@@ -45,9 +45,7 @@ def test_mesh_takes_the_result_of_read_mesh(tmp_path):
     np.testing.assert_allclose(mesh.points, points)
     np.testing.assert_array_equal(mesh.cells, triangles)
     assert mesh.radius == 0.01
-    with pytest.raises(
-        ddg.SceneError, match="there are no triangles; give points and cells, or what read_mesh returns"
-    ):
+    with pytest.raises(ddg.SceneError, match=r"there are no triangles; give points .* or what read_mesh returns"):
         ddg.Mesh(points)
 
 

@@ -98,7 +98,9 @@ class Mesh:
             for name, value in zip(("points", "cells"), self.points[:2], strict=True):
                 object.__setattr__(self, name, value)
         if self.cells is None:
-            raise SceneError("Mesh: there are no triangles; give points and cells, or what read_mesh returns")
+            raise SceneError(
+                "Mesh: there are no triangles; give points (points, 3) and cells (T, 3), or what read_mesh returns"
+            )
         points = argument_checks.array("Mesh: points", self.points, "give (points, 3) [m]").copy()
         cells = argument_checks.triangles("Mesh: triangles", self.cells)
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():

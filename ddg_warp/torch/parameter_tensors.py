@@ -4,6 +4,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core import outcome
 from ddg_warp.model.parameters import valid_numbers
@@ -33,7 +34,7 @@ class ParameterTensors:
             SceneError: nothing has it.
         """
         if not isinstance(name, str):
-            raise SceneError(f"parameters: {name!r} is no name; this model has {', '.join(self.names())}{near}")
+            raise SceneError(f"parameters: {name!r} is no name; this model has {', '.join(self.names())}")
         if name not in self._found:
             if name in user_force_parameters.names(self.model):
                 storage = user_force_parameters.array_views(self.model, name)
@@ -47,7 +48,7 @@ class ParameterTensors:
                 )
             if not storage[1]:
                 near = argument_checks.nearest(name, self.names())
-                raise SceneError(f"parameters: no object has {name!r}; this model has {', '.join(self.names())}")
+                raise SceneError(f"parameters: no object has {name!r}; this model has {', '.join(self.names())}{near}")
             self._found[name] = storage
         return self._found[name]
 
