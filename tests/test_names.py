@@ -165,6 +165,28 @@ def test_resultants_of_a_bar_under_tension(options, dimension, device):
     np.testing.assert_allclose(bar.moment[-1], 0.0)
 
 
+@pytest.mark.parametrize("joined", [False, True])
+def test_resultants_of_worlds_have_an_axis(joined, device):
+    """N of each world follows the positions there; springs carry neither moment nor shear."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    rod = scene.add_rod(straight(4), **SOFT)
+    spring = scene.add_rod(straight(3, start=1.0), bend=False, **SOFT)
+    if joined:
+        scene.join([(rod, -1), (spring, 0)], rigid=False)
+    scene.clamp(rod)
+    scene.fix(spring, [0, -1])
+    model = scene.build(device, "float64", worlds=2)
+    points = model.state().points()
+    points[1, 6:, 0] += 1e-3  # last node of the spring, over edges of 0.5 m
+    stresses = model.stresses(model.state(points=points))
+    stretched = stresses.rod(spring)
+    expected = YOUNG * np.pi * RADIUS**2 * 1e-3 / 0.5
+    np.testing.assert_allclose(stretched.axial_force, [[0.0, 0.0], [0.0, expected]], rtol=1e-9, atol=1e-9)
+    for values in (stretched.shear, stretched.moment, stretched.torque):
+        np.testing.assert_array_equal(values, np.zeros(values.shape))
+    assert [values.shape for values in vars(stresses.rod(rod)).values()] == [(2, 3), (2, 3, 3), (2, 4, 3), (2, 4)]
+
+
 def test_resultants_of_a_bent_ring(device):
     """M = EI / r about the axis of a ring of radius r from a straight rod, and no shear."""
     n, r = 60, 0.5

@@ -129,7 +129,7 @@ def _rod_resultants(stresses: Stresses, model, state, rod: int) -> RodResultants
     length = np.linalg.norm(vector, axis=-1, keepdims=True)
     tangent = vector / length
     # moment at both ends of every edge, (worlds, edges, 2, 3)
-    ends = np.full((*tangent.shape[:2], 2, 3), np.nan)
+    ends = np.full((*tangent.shape[:2], 2, 3), np.nan if piece.vertices else 0.0)
     for k, values in piece.vertices:
         moment = _vectors(values, tangent, piece.director, k, (k + 1) % edges)
         ends[:, k, 1], ends[:, (k + 1) % edges, 0] = moment, moment

@@ -59,7 +59,8 @@ class Handles(Sequence):
         return item in self._indices
 
     def __array__(self, dtype=None, copy=None) -> np.ndarray:
-        return np.asarray(self._indices, dtype=dtype)
+        indices = self._indices
+        return np.arange(indices.start, indices.stop, indices.step, dtype=dtype)
 
     def __eq__(self, sequence) -> bool:
         return list(self._indices) == list(sequence) if isinstance(sequence, Sequence) else NotImplemented
