@@ -50,6 +50,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time see `_HOME`
     from ddg_warp.solve.stepping.adaptive_step import AdaptiveStepper
     from ddg_warp.solve.stepping.integrator import Integrator
     from ddg_warp.torch import Simulator
+    from ddg_warp.view.live import Viewer
 
 __version__ = "0.2.0"
 __all__ = [
@@ -86,6 +87,7 @@ __all__ = [
     "Statics",
     "Stiffness",
     "StopCriterion",
+    "Viewer",
     "Viscous",
     "bench",
     "continuation",
@@ -133,6 +135,7 @@ _HOME = {
     "Stiffness": "scene.material",
     "StopCriterion": "scene.equilibrium_path",
     "PathAnalysis": "scene.descriptions",
+    "Viewer": "view.live",
     "Viscous": "scene.drag",
     "simulate": "run.simulate",
     "read_curves": "io:read",

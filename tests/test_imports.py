@@ -18,6 +18,7 @@ LAYERS = (
     "solve",
     "postprocess",
     "adjoint",
+    "view",
     "run",
     "torch",
     "data",

@@ -1,4 +1,4 @@
-"""The command line: `ddg-warp run | sweep | list | check | gradients | bench | export | warmup | info`.
+"""The command line: `ddg-warp run | view | sweep | list | check | gradients | bench | export | warmup | info`.
 
 Exit codes: 0 done, 1 a check or the solver failed, 2 invalid input, 130 interrupted, 141 broken pipe.
 """
@@ -99,6 +99,21 @@ def parser(arguments: list[str]) -> Parser:
     run.add_argument("--json", type=Path, metavar="FILE", help="write the summary to FILE too")
     if arguments[:1] == ["run"] and len(arguments) > 1 and not arguments[1].startswith("-"):
         add_parameters(run.add_argument_group(f"parameters of {arguments[1]}"), load_scene(arguments[1]))
+
+    view = commands.add_parser("view", help="show a run in the browser, also one that still goes on")
+    view.set_defaults(command=view_run)
+    view.add_argument("directory", type=Path, metavar="DIR", help="directory of a run")
+    view.add_argument(
+        "--port", type=int, default=8080, help="port of the page; a later one if it is taken (default: 8080)"
+    )
+    view.add_argument(
+        "--host", default="127.0.0.1", help="address to serve; 0.0.0.0 for other machines (default: this machine)"
+    )
+    view.add_argument("--no-browser", action="store_true", help="print the address only")
+    view.add_argument(
+        "--save", type=Path, metavar="FILE", help="write FILE.html, which plays without Python, or FILE.viser"
+    )
+    view.add_argument("--field", default="none", metavar="NAME", help="field that colors a saved view")
 
     sweep = commands.add_parser("sweep", help="run a scene over ranges of its parameters, into a data set")
     sweep.set_defaults(command=command.sweep_scene)
@@ -370,6 +385,19 @@ def compile_kernels(chosen: argparse.Namespace) -> int:
     require_device(chosen.device)
     for name, seconds in warm_up(chosen.device):
         print(f"{name}: {seconds:.3g} s", flush=True)
+    return DONE
+
+
+def view_run(chosen: argparse.Namespace) -> int:
+    """Show a run in the browser, or save a view of it."""
+    from ddg_warp.view import player
+
+    with refused():
+        if chosen.save is None:
+            player.view(chosen.directory, port=chosen.port, host=chosen.host, browser=not chosen.no_browser)
+            return DONE
+        player.save(chosen.directory, chosen.save, field=chosen.field)
+    print(f"wrote {chosen.save}")
     return DONE
 
 

@@ -83,6 +83,12 @@ class Result:
         ended = f"; failed: {self.failure}" if self.failure else ""
         return f"<Result: {len(self.times)} states, times {reached}, observed {names}, {self.wall_time:.3g} s of wall time{ended}>"
 
+    def _repr_html_(self) -> str | None:
+        """Return a page of the last state for notebooks; None without viser or a state."""
+        from ddg_warp.view.notebook import state_frame
+
+        return state_frame(self.model, self.state)
+
     def fail(self, error: SolverError, said: str = "") -> None:
         """Store failure and outcome of an early end."""
         self.failure, self.outcome = f"{said}{error}", error.outcome or "failed"

@@ -1,0 +1,1 @@
+"""Viewer in the browser: recorded and running simulations, on viser (extra `view`)."""

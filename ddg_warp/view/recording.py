@@ -1,0 +1,129 @@
+"""Frames of a recorded run, also of a run that still goes on."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from ddg_warp.errors import DataError
+from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader
+from ddg_warp.postprocess.fields import CELL_FIELDS, POINT_FIELDS
+from ddg_warp.view.drawing import Drawing, Frame, largest_force, value_range
+
+SAMPLES = 16  # frames that give ranges of fields and forces
+SPEED = "speed [m/s]"
+NO_FIELD = "none"
+
+
+class Recording:
+    """Frames of DIR/trajectory.h5.
+
+    Args:
+        directory: DIR, or the file.
+
+    Attributes:
+        drawing: `Drawing` of the scene; None while there is no frame.
+        fields: Names of the fields to color by, with units.
+
+    Raises:
+        TrajectoryError: The file cannot be read.
+        DataError: There is no run in the directory.
+    """
+
+    def __init__(self, directory):
+        path = Path(directory)
+        self.path = path if path.suffix == ".h5" else path / "trajectory.h5"
+        if not self.path.is_file():
+            raise DataError(
+                f"there is no run in {directory}: {self.path} is missing; give the folder of `ddg-warp run`"
+            )
+        self._reader: TrajectoryReader | None = None
+        self.drawing: Drawing | None = None
+        self.refresh()
+
+    def refresh(self) -> bool:
+        """Read frames that were added to the file; return True if there are any."""
+        status = os.stat(self.path)
+        version = status.st_mtime_ns, status.st_size
+        if self._reader is not None and version == self._version:
+            return False
+        count = 0 if self._reader is None else len(self._reader)
+        self.close()
+        self._reader, self._version = TrajectoryReader(self.path), version
+        reader = self._reader
+        if self.drawing is None and len(reader):
+            worlds = int(np.prod(reader.points.shape[1:-2]))
+            self.drawing = Drawing(reader.curves, reader.surfaces, worlds, reader.points[0], reader.obstacles)
+        return len(reader) != count
+
+    def __len__(self) -> int:
+        return len(self._reader)
+
+    @property
+    def times(self) -> np.ndarray:
+        """Times of the frames [s]; the numbers of states without a time."""
+        return self._reader.time
+
+    @property
+    def moving(self) -> bool:
+        """True if times are seconds of a motion, not numbers of equilibria or load parameters."""
+        return self._reader.time_is == "state" and "load" not in self._reader.series
+
+    @property
+    def fields(self) -> dict[str, str]:
+        """Names of the fields in the file, by label."""
+        named = {label(name): name for name in self._reader.fields}
+        return ({SPEED: SPEED} if self._reader.velocities is not None else {}) | named
+
+    def frame(self, k: int, field: str = NO_FIELD) -> Frame:
+        """Return frame k with the values of a field, given by its label."""
+        reader = self._reader
+        return Frame(
+            float(reader.time[k]),
+            reader.points[k].reshape(-1, 3),
+            None if field == NO_FIELD else self._values(k, field),
+            None if reader.obstacle_points is None else first_world(reader.obstacle_points[k]),
+            None if reader.contacts is None else reader.contacts[k],
+        )
+
+    def range(self, field: str) -> tuple[float, float]:
+        """Return the least and largest value of a field, over SAMPLES frames of the run."""
+        return value_range(self._values(k, field) for k in self.sample(SAMPLES))
+
+    def largest_force(self) -> float:
+        """Return the largest contact force [N] over SAMPLES frames of the run; 0 without contacts."""
+        contacts = self._reader.contacts
+        return 0.0 if contacts is None else largest_force(contacts[k] for k in self.sample(SAMPLES))
+
+    def sample(self, count: int) -> list[int]:
+        """Return at most `count` frame numbers at equal distances, first and last included."""
+        return sorted({round(k) for k in np.linspace(0, len(self) - 1, min(count, len(self)))})
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._reader is not None:
+            self._reader.close()
+
+    def _values(self, k: int, field: str) -> np.ndarray:
+        if field not in self.fields:
+            raise TrajectoryError(f"{self.path}: there is no field {field!r}; recorded are {', '.join(self.fields)}")
+        name = self.fields[field]
+        if name == SPEED:
+            return np.linalg.norm(self._reader.velocities[k].reshape(-1, 3), axis=1)
+        values = self._reader.fields[name][k]
+        if name in CELL_FIELDS:
+            return self.drawing.at_points(values[len(self.drawing.shapes.curves.counts) :])
+        return values
+
+
+def label(name: str) -> str:
+    """Return the label of a recorded field: name and unit."""
+    text = (POINT_FIELDS | CELL_FIELDS).get(name, "")
+    return f"{name} [{text.rpartition('[')[2]}" if text.endswith("]") else name
+
+
+def first_world(values: np.ndarray) -> np.ndarray:
+    """Return the values of the first world (M, 3), of (M, 3) or (worlds, M, 3)."""
+    return values.reshape(-1, *values.shape[-2:])[0]
