@@ -18,6 +18,7 @@ import numpy as np
 from ddg_warp.io.colors import PALETTE, SCALE, on_scale
 from ddg_warp.io.contact_records import Contacts
 from ddg_warp.io.shapes import Curves, Shapes, Surfaces
+from ddg_warp.scene.obstacles import PLANE
 
 EDGES, TRIANGLES, ARROWS = 30_000, 50_000, 1_000  # drawn at most
 RODS = 500  # left at least where rods are left out
@@ -25,8 +26,9 @@ WIDTHS = 8  # different thicknesses of rods at most
 THINNEST = 1.5e-3  # of a drawn rod, over the size of the scene
 UNDEFINED = (0.72, 0.72, 0.72)  # RGB where a field has no value
 FIELD_OF_VIEW = np.radians(45.0)
+MARGIN = 1.15  # around the points in a view
 ELEVATION, AZIMUTH = np.radians((18.0, -58.0))  # of the eye
-LONGEST_ARROW = 0.15  # of the size of the scene
+ARROW_LENGTH = 0.15  # of the arrow of a typical force, over the size of the scene
 SIZE_STEPS = 2**14  # steps of rounded coordinates along the size of a scene
 
 
@@ -174,17 +176,25 @@ class Drawing:
             return np.bincount(corners, np.repeat(values, 3), len(self._corners)) / self._corners
 
     def camera(self, *frames: Frame) -> dict[str, np.ndarray]:
-        """Return eye position and target of a camera that sees all points of some frames [m].
+        """Return eye position and target of a camera that sees all points and bounded obstacles of some frames [m].
 
         A scene in the plane y = const. is seen along y.
         """
         points = np.concatenate([frame.points for frame in frames])
+        if self.obstacles is not None:
+            bounded = self.obstacles.kinds != PLANE
+            bodies = [self.obstacles.surface(frame.obstacles, bounded)[0] for frame in frames]
+            points = np.concatenate([points, *bodies])
         low, high = points.min(0), points.max(0)
-        center, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low)) or 0.5 * self.size
-        flat = high[1] - low[1] <= 1e-6 * radius
+        center = 0.5 * (low + high)
+        flat = high[1] - low[1] <= 1e-6 * self.size
         elevation, azimuth = (0.0, -0.5 * np.pi) if flat else (ELEVATION, AZIMUTH)
+        right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
         toward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-        return {"position": center + radius / np.sin(0.5 * FIELD_OF_VIEW) * toward, "look_at": center}
+        offset = points - center
+        aside = np.maximum(np.abs(offset @ right), np.abs(offset @ np.cross(toward, right)))
+        distance = float(np.max(offset @ toward + MARGIN * aside / np.tan(0.5 * FIELD_OF_VIEW))) or self.size
+        return {"position": center + distance * toward, "look_at": center}
 
 
 def _corner_counts(shapes: Shapes) -> np.ndarray:
@@ -272,10 +282,11 @@ def arrows(contacts: Contacts | None, length_per_force: float) -> np.ndarray:
     return np.stack([start, start + length_per_force * force[largest]], 1)
 
 
-def largest_force(frames_contacts) -> float:
+def largest_force(contacts: Contacts | None) -> float:
     """Return the largest force of pairs in contact [N], friction included; 0 without pairs."""
-    sizes = [np.linalg.norm(each.force + each.friction, axis=1).max() for each in frames_contacts if each]
-    return float(max(sizes, default=0.0))
+    if contacts is None or not len(contacts):
+        return 0.0
+    return float(np.linalg.norm(contacts.force + contacts.friction, axis=1).max())
 
 
 def rounded(points: np.ndarray, size: float) -> np.ndarray:

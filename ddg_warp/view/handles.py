@@ -157,4 +157,4 @@ def _center(model, grip) -> np.ndarray:
                 [*support.nodes, *support.edges, *({"first": [0], "last": [-1]}.get(support.end, []))], int
             )
             rows += [starts[rod] + nodes % curves.counts[rod] for rod in support.rods]
-    return points[np.concatenate(rows)].mean(0) if rows else np.array(grip.pivot)
+    return points[np.unique(np.concatenate(rows))].mean(0) if rows else np.array(grip.pivot)

@@ -61,18 +61,20 @@ class Viewer:
         self._sliders: list[tuple[ParameterSlider, object]] = []
         self._wanted: list[str] = []
         self._range: tuple[float, float] | None = None
-        self._single = self._reset = False
+        self._single = self._reset = self._fitted = False
         self._make_controls(paused, pace)
         self.stage.aim(self._frame(state, NO_FIELD))
         print(f"{drawing.note}\n{self.stage.url}", flush=True)
 
     def _make_controls(self, paused: bool, pace: float) -> None:
         gui, model = self.stage.server.gui, self.model
-        gui.configure_theme(show_logo=False, show_share_button=False)
+        gui.configure_theme(
+            show_logo=False, control_layout="collapsible", control_width="large", show_share_button=False
+        )
         self._pause = gui.add_checkbox("pause", paused)
         gui.add_button("step").on_click(lambda _: self._ask_step())
         gui.add_button("reset").on_click(lambda _: self._ask_reset())
-        self._pace = gui.add_number("simulated seconds a second, 0: no bound", initial_value=pace, min=0.0, step=0.01)
+        self._pace = gui.add_number("speed [s/s], 0: unbounded", initial_value=pace, min=0.0, step=0.01)
         self._time = gui.add_text("time [s]", "", disabled=True)
         names = {SPEED: SPEED}
         names |= {label(name): name for name in POINT_FIELDS if len(model.curves.counts)}
@@ -81,6 +83,7 @@ class Viewer:
         self._field = gui.add_dropdown("field", (NO_FIELD, *names))
         self._legend = gui.add_html("")
         self._forces = gui.add_checkbox("contact forces", True, visible=model.touch is not None)
+        gui.add_button("fit the view").on_click(lambda _: self._ask_fit())
         gui.add_markdown(self.stage.drawing.note)
         self._springs = Springs(self.stage, point_masses(model)[0], model)
         self._grips = Grips(self.stage, model)
@@ -129,7 +132,7 @@ class Viewer:
         """Show a state, wait while the loop is paused, and return the state to go on from.
 
         States of less than 1/30 s of wall time after the last are not drawn. The returned state is the given one, or after a reset
-        the first that was shown.
+        the first that was shown; parameters stay.
         """
         check_state("show", self.model, state)
         if self._first is None:
@@ -184,6 +187,9 @@ class Viewer:
     def _ask_reset(self) -> None:
         self._reset = True
 
+    def _ask_fit(self) -> None:
+        self._fitted = True
+
     def _apply(self) -> None:
         """Add requested sliders, and set parameters that sliders have changed."""
         while self._wanted:
@@ -210,8 +216,11 @@ class Viewer:
         if self._legend.content != content:
             self._legend.content = content
         stage.forces = self._forces.value
-        stage.newtons = max(stage.newtons, largest_force([frame.contacts]))
+        stage.newtons = max(stage.newtons, largest_force(frame.contacts))
         stage.show(frame)
+        if self._fitted:
+            self._fitted = False
+            stage.fit(frame)
         self._time.value = f"{state.time:.6g}"
         self._springs.show(frame.points)
         self._shown_at = time.monotonic()

@@ -30,10 +30,12 @@ class Player:
     def __init__(self, recording: Recording, *, port: int = PORT, host: str = "127.0.0.1"):
         self.recording = recording
         self.stage = Stage(recording.drawing, port=port, host=host)
-        self.stage.newtons = recording.largest_force()
+        self.stage.newtons = recording.typical_force()
         self.stage.aim(*(recording.frame(k) for k in recording.sample(3)))
         gui, count = self.stage.server.gui, len(recording)
-        gui.configure_theme(show_logo=False, show_share_button=False)
+        gui.configure_theme(
+            show_logo=False, control_layout="collapsible", control_width="large", show_share_button=False
+        )
         self._play = gui.add_button("play")
         self._playing, self._clock, self._shown, self._changed = False, 0.0, -1, True
         self._line = gui.add_slider("frame", 0, max(count - 1, 1), 1, 0)
@@ -45,10 +47,11 @@ class Player:
         self._field = gui.add_dropdown("field", (NO_FIELD, *recording.fields))
         self._legend = gui.add_html("")
         self._forces = gui.add_checkbox("contact forces", True, visible=bool(self.stage.newtons))
+        gui.add_button("fit the view").on_click(lambda _: self._request_fit())
         self._note = gui.add_markdown("")
         self._play.on_click(lambda _: self._toggle())
         self._line.on_update(self._moved)
-        self._chosen = NO_FIELD, True
+        self._chosen, self._fitted = (NO_FIELD, True), False
         self._write_note()
 
     @property
@@ -74,6 +77,9 @@ class Player:
             last = clock
             if self._chosen != (self._field.value, self._forces.value):
                 self._choose(self._field.value, self._forces.value)
+            if self._fitted:
+                self._fitted = False
+                self.stage.fit(self.recording.frame(int(self._shown)))
             if self._changed or self._line.value != self._shown:
                 self._changed = False
                 self._draw(int(self._line.value))
@@ -86,6 +92,9 @@ class Player:
         if self._playing and self._line.value >= len(times) - 1:
             self._line.value = 0
         self._clock = float(times[min(int(self._line.value), len(times) - 1)])
+
+    def _request_fit(self) -> None:
+        self._fitted = True
 
     def _moved(self, event) -> None:
         if event.client is not None:  # moved by a person, not by play
@@ -184,7 +193,7 @@ def save(directory, path, *, field: str = NO_FIELD, frames: int = SAVED, title: 
     duration = (recording.times[-1] - recording.times[0]) / initial_speed(recording.times)
     stage = Stage(recording.drawing)
     try:
-        stage.newtons = recording.largest_force()
+        stage.newtons = recording.typical_force()
         if label != NO_FIELD:
             stage.field = (label, *recording.range(label))
         stage.aim(*(recording.frame(k) for k in recording.sample(3)))

@@ -92,10 +92,11 @@ class Recording:
         """Return the least and largest value of a field, over SAMPLES frames of the run."""
         return value_range(self._values(k, field) for k in self.sample(SAMPLES))
 
-    def largest_force(self) -> float:
-        """Return the largest contact force [N] over SAMPLES frames of the run; 0 without contacts."""
+    def typical_force(self) -> float:
+        """Return the median over SAMPLES frames of the largest contact force [N]; 0 without contacts."""
         contacts = self._reader.contacts
-        return 0.0 if contacts is None else largest_force(contacts[k] for k in self.sample(SAMPLES))
+        sample = [] if contacts is None else [largest_force(contacts[k]) for k in self.sample(SAMPLES)]
+        return float(np.median([force for force in sample if force > 0.0] or [0.0]))
 
     def sample(self, count: int) -> list[int]:
         """Return at most `count` frame numbers at equal distances, first and last included."""

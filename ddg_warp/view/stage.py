@@ -14,9 +14,9 @@ from ddg_warp.errors import DataError
 from ddg_warp.geometry.operators import vertex_normals
 from ddg_warp.io.colors import CONTACT, OBSTACLE
 from ddg_warp.view.drawing import (
+    ARROW_LENGTH,
     ARROWS,
     FIELD_OF_VIEW,
-    LONGEST_ARROW,
     Drawing,
     Frame,
     Skin,
@@ -62,7 +62,7 @@ class Stage:
     Attributes:
         server: `viser.ViserServer`.
         field: Label, least and largest value of the field that colors the scene; None without.
-        newtons: Force of an arrow of the longest length [N].
+        newtons: Force of an arrow as long as ARROW_LENGTH of the size [N]; 0 draws none.
         forces: Whether contact forces are drawn.
     """
 
@@ -88,6 +88,12 @@ class Stage:
         distance = float(np.linalg.norm(view["position"] - view["look_at"]))
         camera.near, camera.far = 1e-3 * distance, 1e2 * distance
 
+    def fit(self, frame: Frame) -> None:
+        """Fit the cameras of open pages to a frame."""
+        view = self.drawing.camera(frame)
+        for client in self.server.get_clients().values():
+            client.camera.position, client.camera.look_at = view["position"], view["look_at"]
+
     def show(self, frame: Frame) -> None:
         """Draw a frame."""
         with self.server.atomic():
@@ -97,7 +103,7 @@ class Stage:
             points = rounded(frame.points, self.drawing.size)
             for k, lines in enumerate(self.drawing.lines):
                 shades = np.repeat(as_bytes(lines.color)[:, None], 2, 1) if colors is None else colors[lines.ends]
-                self._lines(f"/rods/{k}", points[lines.ends], shades, lines.width)
+                self._lines(f"/rods/{k}", points[lines.ends], linear(shades), lines.width)
             for k, skin in enumerate(self.drawing.skins):
                 self._skin(k, skin, points[skin.rows], None if colors is None else colors[skin.rows])
             if frame.obstacles is not None and len(frame.obstacles):
@@ -108,7 +114,7 @@ class Stage:
         """Return the scale of the arrows, or an empty text without forces."""
         if not (self.forces and self.newtons):
             return ""
-        scale = f"{self.newtons:.3g} N for {LONGEST_ARROW:.0%} of the size of the scene"
+        scale = f"{self.newtons:.3g} N for {ARROW_LENGTH:.0%} of the size of the scene"
         return f"arrows: force on the first object of a contact, {scale}; the {ARROWS} largest"
 
     def save(self, path, frames: Iterable[Frame], seconds: float, title: str = "", name: str = "t") -> None:
@@ -139,10 +145,11 @@ class Stage:
         texts = "".join(
             f"<div>{html.escape(text)}</div>" for text in (title, self.drawing.note, self.force_text()) if text
         )
-        overlay = (
-            '<div style="position:fixed;left:0;bottom:0;z-index:9;max-width:40em;padding:0.4em 0.8em;font:13px sans-serif;'
-            f'background:rgba(255,255,255,0.7);pointer-events:none">{texts}{scale}</div>'
+        style = (
+            "position:fixed;left:0;bottom:3.5em;z-index:9;min-width:16em;max-width:40em;padding:0.4em 0.8em;"
+            "font:13px sans-serif;background:rgba(255,255,255,0.7);pointer-events:none"
         )
+        overlay = f'<div style="{style}">{texts}{scale}</div>'
         page = serializer.as_html()
         end = page.rindex("</body>")
         return page[:end] + overlay + page[end:]
@@ -165,7 +172,7 @@ class Stage:
                 label = self.server.scene.add_label("/time", f"{name} = {frame.time:.4g}", position=corner)
             elif name:
                 label.text = f"{name} = {frame.time:.4g}"
-            serializer.insert_sleep(seconds)
+            serializer.insert_sleep(float(seconds))
         if label is not None:
             label.remove()
         return serializer
@@ -228,7 +235,7 @@ class Stage:
 
     def _arrows(self, frame: Frame) -> None:
         name, size = "/contacts", self.drawing.size
-        scale = LONGEST_ARROW * size / self.newtons if self.newtons else 0.0
+        scale = ARROW_LENGTH * size / self.newtons if self.newtons else 0.0
         ends = arrows(frame.contacts if self.forces and scale else None, scale)
         handle = self._handles.get(name)
         if handle is None and not len(ends):
@@ -238,9 +245,9 @@ class Stage:
                 name,
                 ends,
                 tuple(as_bytes(CONTACT).tolist()),
-                shaft_radius=2e-3 * size,
-                head_radius=5e-3 * size,
-                head_length=1e-2 * size,
+                shaft_radius=3e-3 * size,
+                head_radius=8e-3 * size,
+                head_length=2e-2 * size,
             )
             return
         handle.visible = bool(len(ends))
@@ -258,11 +265,11 @@ def glb(points: np.ndarray, triangles: np.ndarray, colors: np.ndarray) -> bytes:
     """
     normals = vertex_normals(type("Faces", (), {"triangles": triangles}), points.astype(float))
     alpha = np.full((len(colors), 1), 255, np.uint8)
-    linear = np.concatenate([_linear(colors), alpha], axis=1)
+    shades = np.concatenate([linear(colors), alpha], axis=1)
     parts = [
         (points.astype("<f4"), 5126, "VEC3", {"min": points.min(0).tolist(), "max": points.max(0).tolist()}),
         (normals.astype("<f4"), 5126, "VEC3", {}),
-        (linear, 5121, "VEC4", {"normalized": True}),
+        (shades, 5121, "VEC4", {"normalized": True}),
         (triangles.astype("<u4").ravel(), 5125, "SCALAR", {}),
     ]
     views, accessors, content = [], [], b""
@@ -300,7 +307,7 @@ def glb(points: np.ndarray, triangles: np.ndarray, colors: np.ndarray) -> bytes:
     )
 
 
-def _linear(colors: np.ndarray) -> np.ndarray:
-    """Return linear RGB of sRGB, both uint8, as glTF stores colors."""
+def linear(colors: np.ndarray) -> np.ndarray:
+    """Return linear RGB of sRGB, both uint8, as vertices of glTF and of three.js have it."""
     x = colors / 255.0
     return np.round(255.0 * np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)).astype(np.uint8)
