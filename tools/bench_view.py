@@ -9,6 +9,7 @@ States are synthetic: the drawn shapes in a shear wave.
 
 import argparse
 import io
+import os
 import shutil
 import tempfile
 import threading
@@ -71,7 +72,7 @@ def record(scene: ddg.Scene, path: Path, frames: int) -> None:
 
 
 def pixels(page) -> int:
-    """Return the number of colored pixels of the page beside its panels."""
+    """Return the number of colored pixels of the page without panels."""
     from matplotlib.image import imread
 
     picture = imread(io.BytesIO(page.screenshot()))[150:, :620, :3]
@@ -85,7 +86,8 @@ def measure(browser, scene: ddg.Scene, frames: int, played: bool, picture: Path 
         page = browser.new_page(viewport=SIZE)
         began = time.perf_counter()
         player = Player(Recording(folder))
-        threading.Thread(target=player.run, args=(PLAY + 60.0,), daemon=True).start()
+        thread = threading.Thread(target=player.run, args=(PLAY + 15.0 if played else 15.0,), daemon=True)
+        thread.start()
         page.goto(player.stage.url)
         while pixels(page) < 200:
             time.sleep(0.05)
@@ -107,6 +109,7 @@ def measure(browser, scene: ddg.Scene, frames: int, played: bool, picture: Path 
             page.screenshot(path=picture)
         page.close()
         player.stage.close()
+        thread.join()
         return row | {"drawn": player.stage.drawing.note}
 
 
@@ -135,6 +138,7 @@ def main() -> None:
     origin = {
         "command": "python tools/bench_view.py",
         "machine": machine(),
+        "load_average": os.getloadavg()[0],
         "browser": f"Chromium {version}, SwiftShader",
     }
     write_table(chosen.out / "view", rows, origin)

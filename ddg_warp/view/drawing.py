@@ -20,10 +20,11 @@ from ddg_warp.io.contact_records import Contacts
 from ddg_warp.io.shapes import Curves, Shapes, Surfaces
 from ddg_warp.scene.obstacles import PLANE
 
-EDGES, TRIANGLES, ARROWS = 30_000, 50_000, 1_000  # drawn at most
+EDGES, TRIANGLES, ARROWS = 30_000, 30_000, 1_000  # drawn at most
 RODS = 500  # left at least where rods are left out
 WIDTHS = 8  # different thicknesses of rods at most
-THINNEST = 1.5e-3  # of a drawn rod, over the size of the scene
+THINNEST = 4e-3  # thickness over the size of the scene below which rods are lines of PIXELS
+PIXELS = 2.0
 UNDEFINED = (0.72, 0.72, 0.72)  # RGB where a field has no value
 FIELD_OF_VIEW = np.radians(45.0)
 MARGIN = 1.15  # around the points in a view
@@ -58,7 +59,7 @@ class Lines:
     Attributes:
         ends: Rows of both nodes of each edge, shape (n, 2), int.
         color: RGB of each edge, shape (n, 3).
-        width: Thickness [m].
+        width: Thickness [m]; 0 for lines of PIXELS.
     """
 
     ends: np.ndarray
@@ -130,8 +131,8 @@ class Drawing:
         if len(np.unique(widths)) > WIDTHS:
             widths = np.full(len(owner), np.median(widths))
         colors = np.array(PALETTE)[np.asarray(curves.batch)[owner] % len(PALETTE)]
-        width_of = {width: max(width, THINNEST * self.size) for width in np.unique(widths)}
-        return [Lines(ends[widths == w], colors[widths == w], drawn) for w, drawn in width_of.items()]
+        widths[widths < THINNEST * self.size] = 0.0
+        return [Lines(ends[widths == width], colors[widths == width], width) for width in np.unique(widths)]
 
     def edges(self, rods: np.ndarray, stride: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """Return rows of both ends of the edges between every `stride`-th node of rods (n, 2), and their rods (n,)."""
@@ -229,18 +230,23 @@ def simplified(points: np.ndarray, triangles: np.ndarray, limit: int) -> tuple[n
     side = np.sqrt(2.0 * area / limit)
     while True:
         cell = np.floor((x - low) / side).astype(np.int64)
-        _, cube = np.unique(cell, axis=0, return_inverse=True)
-        cube = cube.ravel()
+        _, cube = np.unique(_key(cell), return_inverse=True)
         off_center = np.linalg.norm(x - low - (cell + 0.5) * side, axis=1)
         order = np.lexsort((off_center, cube))
         first = np.concatenate([[True], np.diff(cube[order]) > 0])
         faces = cube[corners]
         p, q, r = faces.T
         faces = faces[(p != q) & (q != r) & (r != p)]
-        _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+        _, once = np.unique(_key(np.sort(faces, axis=1)), return_index=True)
         if len(once) <= limit:
             return rows[order[first]], faces[np.sort(once)]
         side *= 1.1
+
+
+def _key(rows: np.ndarray) -> np.ndarray:
+    """Return one number for each row of three non-negative integers (n, 3)."""
+    a, b, c = rows.T
+    return (a * (b.max(initial=0) + 1) + b) * (c.max(initial=0) + 1) + c
 
 
 def colored(values: np.ndarray, low: float, high: float) -> np.ndarray:

@@ -13,7 +13,7 @@ from ddg_warp.view.drawing import legend
 from ddg_warp.view.recording import NO_FIELD, Recording
 from ddg_warp.view.stage import PORT, Stage
 
-FRAME_RATE = 30.0  # drawn frames a second at most [1/s]
+FRAME_RATE = 24.0  # drawn frames a second at most [1/s]
 POLL = 1.0  # interval of queries for new frames [s]
 SHORTEST, LONGEST = 2.0, 30.0  # duration of a play at the initial speed [s]
 SAVED = 120  # frames of a saved view at most

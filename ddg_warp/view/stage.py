@@ -17,6 +17,7 @@ from ddg_warp.view.drawing import (
     ARROW_LENGTH,
     ARROWS,
     FIELD_OF_VIEW,
+    PIXELS,
     Drawing,
     Frame,
     Skin,
@@ -30,6 +31,7 @@ from ddg_warp.view.drawing import (
 
 PORT = 8080
 OBSTACLE_TRIANGLES = 20_000  # drawn at most, of all obstacles that move, and of all that stand still
+NO_SHADOW = {"cast_shadow": False, "receive_shadow": False}
 
 
 class MissingViewerError(DataError, ImportError):
@@ -180,7 +182,8 @@ class Stage:
     def _lines(self, name: str, points: np.ndarray, colors: np.ndarray, width: float) -> None:
         handle = self._handles.get(name)
         if handle is None:
-            self._handles[name] = self.server.scene.add_line_segments(name, points, colors, thickness=width)
+            thickness = {"thickness": width} if width else {"thickness": PIXELS, "thickness_units": "screen"}
+            self._handles[name] = self.server.scene.add_line_segments(name, points, colors, **thickness)
             return
         handle.points = points
         if not np.array_equal(handle.colors, colors):
@@ -193,13 +196,15 @@ class Stage:
         if colors is None:
             if plain not in handles:
                 color = tuple(as_bytes(skin.color).tolist())
-                handles[plain] = scene.add_mesh_simple(plain, points, skin.triangles, color=color, side="double")
+                handles[plain] = scene.add_mesh_simple(
+                    plain, points, skin.triangles, color=color, side="double", **NO_SHADOW
+                )
             else:
                 handles[plain].vertices = points
         else:
             data = glb(points, skin.triangles, colors)
             if shaded not in handles:
-                handles[shaded] = scene.add_glb(shaded, data)
+                handles[shaded] = scene.add_glb(shaded, data, **NO_SHADOW)
             else:
                 handles[shaded].glb_data = data
         for name, visible in ((plain, colors is None), (shaded, colors is not None)):
@@ -230,7 +235,7 @@ class Stage:
     def _add_obstacles(self, name: str, points: np.ndarray, faces: np.ndarray) -> None:
         color = tuple(as_bytes(OBSTACLE).tolist())
         self._handles[name] = self.server.scene.add_mesh_simple(
-            name, points, faces, color=color, side="double", opacity=0.6
+            name, points, faces, color=color, side="double", opacity=0.6, **NO_SHADOW
         )
 
     def _arrows(self, frame: Frame) -> None:
