@@ -73,6 +73,8 @@ class Stage:
         self.server = viser_module().ViserServer(host=host, port=port, verbose=False)
         self.server.scene.set_up_direction("+z")
         self.server.scene.world_axes.visible = False
+        self.server.scene.configure_environment_map(None)  # reflections would whiten the colors of fields
+        self.server.scene.configure_default_lights(True, cast_shadow=False)
         self.field: tuple[str, float, float] | None = None
         self.newtons, self.forces = 0.0, True
         self._handles: dict[str, object] = {}
