@@ -495,6 +495,21 @@ def test_info_names_versions(capsys):
     assert "warp-lang 1." in capsys.readouterr().out
 
 
+def test_docs_opens_the_built_site(monkeypatch, capsys, tmp_path):
+    import ddg_warp
+
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    monkeypatch.setattr(ddg_warp, "__file__", str(tmp_path / "ddg_warp" / "__init__.py"))
+    assert main(["docs"]) == 2
+    assert "bash tools/site" in capsys.readouterr().err
+    page = tmp_path / "out" / "site" / "index.html"
+    page.parent.mkdir(parents=True)
+    page.touch()
+    assert main(["docs"]) == 0
+    assert opened == [page.as_uri()]
+
+
 @pytest.mark.parametrize("passed", [True, False])
 def test_check_prints_the_derivative_table(monkeypatch, capsys, device, passed):
     from ddg_warp.run import derivative_checks

@@ -1,4 +1,4 @@
-"""Prose lint: count breaches of the house's rules for docstrings, comments, names and the README, against a baseline.
+"""Prose lint: count breaches of the house's rules for docstrings, comments, names, the README and the site, against a baseline.
 
     python tools/lint_prose.py [PATH ...]     compare counts with tools/lint_prose.json; exit 1 where one has grown
     python tools/lint_prose.py --list D1 [PATH ...]   print every finding of a rule (or of `all`)
@@ -15,7 +15,7 @@ S1  sentence of more than 30 words
 S2  sentence with more than one semicolon
 W*  words that have no technical meaning, or several; the table WORDS lists the term of the field instead
 N1  local names and arguments that say nothing (`given`, `found`, `at`, ...)
-R*  rules D3, S1 and the words in the README
+R*  rules D3, S1 and the words in the README and the pages of the site
 """
 
 import argparse
@@ -199,11 +199,11 @@ def lint_source(path: str, source: str) -> list[Finding]:
     return result
 
 
-def lint_readme(text: str) -> list[Finding]:
-    """Return findings of the README's prose, all as rule R; code blocks and tables are left out."""
+def lint_page(path: str, text: str) -> list[Finding]:
+    """Return findings of a page's prose, all as rule R; code blocks and tables are left out."""
     prose = re.sub(r"```.*?```", lambda m: "\n" * m.group().count("\n"), text, flags=re.S)
     prose = "\n".join("" if line.startswith(("|", "    ")) else line for line in prose.split("\n"))
-    found = prose_findings("README.md", 1, prose, rules=[f"W{i}" for i in range(1, 13)])
+    found = prose_findings(path, 1, prose, rules=[f"W{i}" for i in range(1, 13)])
     return [Finding(f.path, f.line, "R", f"{f.rule} {f.text}") for f in found]
 
 
@@ -211,11 +211,11 @@ def lint(paths: list[Path]) -> list[Finding]:
     """Return all findings of files and folders, in order."""
     result = []
     for path in paths:
-        files = sorted(path.rglob("*.py")) if path.is_dir() else [path]
+        files = sorted([*path.rglob("*.py"), *path.rglob("*.md")]) if path.is_dir() else [path]
         for file in files:
             relative = file.resolve().relative_to(ROOT).as_posix() if file.resolve().is_relative_to(ROOT) else file.name
             text = file.read_text()
-            result += lint_readme(text) if file.suffix == ".md" else lint_source(relative, text)
+            result += lint_page(relative, text) if file.suffix == ".md" else lint_source(relative, text)
     return sorted(result)
 
 
@@ -223,7 +223,7 @@ def counts(findings: list[Finding]) -> dict[str, dict[str, int]]:
     """Return {rule: {top folder: count}} of findings, zeros included."""
     found = Counter((finding.rule, finding.path.partition("/")[0]) for finding in findings)
     table = {rule: {folder: found[rule, folder] for folder in FOLDERS} for rule in RULES[:-1]}
-    table["R"] = {"README.md": found["R", "README.md"]}
+    table["R"] = {place: found["R", place] for place in ("README.md", "tools")}
     return table
 
 

@@ -1,4 +1,4 @@
-"""The command line: `ddg-warp run | view | sweep | list | check | gradients | bench | export | warmup | info`.
+"""The command line: `ddg-warp run | view | sweep | list | check | gradients | bench | export | warmup | info | docs`.
 
 Exit codes: 0 done, 1 a check or the solver failed, 2 invalid input, 130 interrupted, 141 broken pipe.
 """
@@ -162,6 +162,11 @@ def parser(arguments: list[str]) -> Parser:
 
     info = commands.add_parser("info", help="show versions, devices and machine")
     info.set_defaults(command=show_info)
+
+    docs = commands.add_parser(
+        "docs", help="open the documentation", description="Open the documentation that `tools/site` has built."
+    )
+    docs.set_defaults(command=open_docs)
     return top
 
 
@@ -398,6 +403,20 @@ def view_run(chosen: argparse.Namespace) -> int:
             return DONE
         player.save(chosen.directory, chosen.save, field=chosen.field)
     print(f"wrote {chosen.save}")
+    return DONE
+
+
+def open_docs(chosen: argparse.Namespace) -> int:
+    """Open the built site in a browser."""
+    import webbrowser
+
+    import ddg_warp
+
+    page = Path(ddg_warp.__file__).parents[1] / "out" / "site" / "index.html"
+    if not page.exists():
+        raise InputError(f'there is no {page}; build it in a clone: pip install -e ".[docs]", then bash tools/site')
+    print(page)
+    webbrowser.open(page.as_uri())
     return DONE
 
 

@@ -1,0 +1,48 @@
+"""Settings of the site; blocks of its pages are filled by `expand`, from results, scenes and docstrings."""
+
+import re
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from expand import expand
+
+import ddg_warp
+
+project = "ddg_warp"
+release = version = ddg_warp.__version__
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+html_theme = "furo"
+html_title = f"ddg_warp {release}"
+myst_heading_anchors = 3
+default_role = "literal"
+autodoc_member_order = "bysource"
+napoleon_use_ivar = True
+
+
+def setup(app) -> None:
+    """Fill blocks of pages, and make docstrings valid reStructuredText."""
+    app.connect("source-read", lambda _app, _page, source: source.__setitem__(0, expand(source[0])))
+    app.connect("autodoc-process-docstring", escape)
+
+
+def escape(_app, _kind, _name, _object, _options, lines: list[str]) -> None:
+    """Make a docstring reStructuredText, in place: mark blocks of code, set deeper lines apart, and escape signs of mathematics."""
+    result, above, code = [], "", False
+    for line in lines:
+        depth, depth_above = (len(text) - len(text.lstrip()) for text in (line, above))
+        field = above.startswith((":", ".."))
+        if line and not depth:
+            code = False
+        if line and depth and above and not depth_above and not field and not result[-1]:
+            code = True
+            result += ["::", ""]
+        if not code:
+            if line and result and result[-1] and depth != depth_above and not field:
+                result.append("")
+            pieces = re.split(r"(`[^`]*`)", line)
+            line = "".join(p if p.startswith("`") else re.sub(r"([*_|\\])", r"\\\1", p) for p in pieces)
+        result.append(line)
+        above = line or above
+    lines[:] = result
