@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_readme import BLOCKS
+from test_docs import FILES
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
@@ -19,8 +19,10 @@ from ddg_warp.run.cli import main
 from ddg_warp.run.scene_registry import load_file
 from ddg_warp.solve.equilibrium.statics import solve
 
-FILE = Path(tempfile.mkdtemp()) / "my_law.py"  # the README's law, in a file, since Warp reads the source of functions
-FILE.write_text(dict(BLOCKS)["my_law.py"])
+FILE = (
+    Path(tempfile.mkdtemp()) / "my_law.py"
+)  # the law of the documentation, in a file, since Warp reads the source of functions
+FILE.write_text(FILES["my_law.py"])
 saturating = load_file(str(FILE), "law's").saturating
 K, LIMIT = 2.0, 3.0
 LAW = {"rod_bend_twist": ddg.Law(saturating, modulus=K, limit=LIMIT)}
@@ -118,7 +120,7 @@ def test_a_joined_rod_keeps_its_law(device):
     np.testing.assert_allclose(joined[:13], single, atol=1e-8)
 
 
-@pytest.mark.slow  # the README's command runs daily
+@pytest.mark.slow  # its command on the site runs daily
 @pytest.mark.parametrize("damped", [False, True])
 def test_derivatives_of_a_user_law(device, damped):
     term = replace(REGISTRY["rod_bend_twist"], density=saturating).damped(damped)
