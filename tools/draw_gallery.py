@@ -1,9 +1,12 @@
-"""Pictures of the gallery: run scenes and store each picture, made smaller, in tools/results/gallery.
+"""Pictures of the site: run scenes and tutorials, and store their pictures, made smaller, in tools/results/gallery.
 
-python tools/draw_gallery.py [--limit SECONDS] [SCENE ...]    by default all scenes; scenes that take longer are left out
+python tools/draw_gallery.py [--limit SECONDS] [NAME ...]    by default all scenes; scenes that take longer are left out
+python tools/draw_gallery.py --tutorials
 """
 
 import argparse
+import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -14,32 +17,62 @@ from PIL import Image
 from ddg_warp.run.scene_registry import scene_files
 
 GALLERY = Path(__file__).parent / "results" / "gallery"
+TUTORIALS = Path(__file__).parent / "docs" / "tutorials"
 WIDTH = 560  # pixels
+
+
+def store(picture: Path, name: str) -> None:
+    """Store a picture under a name, made smaller."""
+    with Image.open(picture) as image:
+        size = WIDTH, round(image.height * WIDTH / image.width)
+        small = image.convert("RGB").resize(size, Image.Resampling.LANCZOS)
+        small.quantize(64).save(GALLERY / f"{name}.png", optimize=True)
+
+
+def draw_scene(scene: str, limit: float) -> str:
+    """Run a scene for `limit` [s] at most, store a picture, and return how the run ended."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "ddg_warp", "run", scene, "--out", folder, "--force"]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=limit)
+        except subprocess.TimeoutExpired:
+            return f"takes longer than {limit:g} s"
+        picture = Path(folder) / "picture.png"
+        if not picture.exists():
+            return f"no picture: {done.stderr[-300:]}"
+        store(picture, scene)
+        return "its checks pass" if done.returncode == 0 else "A CHECK FAILS"
+
+
+def draw_tutorial(page: Path) -> str:
+    """Run the examples of a page and store the saved pictures."""
+    blocks = re.findall(r"^```python(?: file=(\S+))?\n(.*?)^```", page.read_text(), re.M | re.S)
+    with tempfile.TemporaryDirectory() as folder:
+        for file, text in blocks:
+            if file:
+                (Path(folder) / file).write_text(text)
+        script = "\n".join(text for file, text in blocks if not file)
+        plain = os.environ | {"MPLBACKEND": "agg"}
+        subprocess.run([sys.executable, "-c", script], cwd=folder, env=plain, capture_output=True, check=True)
+        pictures = sorted(Path(folder).glob("*.png"))
+        for picture in pictures:
+            store(picture, f"tutorial_{picture.stem}")
+    return f"{len(pictures)} pictures"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("scenes", nargs="*", metavar="SCENE")
+    parser.add_argument("scenes", nargs="*", metavar="NAME")
     parser.add_argument("--limit", type=float, default=120.0, help="longest run of a scene [s]")
+    parser.add_argument("--tutorials", action="store_true", help="the tutorials, not scenes")
     arguments = parser.parse_args()
     GALLERY.mkdir(exist_ok=True)
+    if arguments.tutorials:
+        for page in sorted(TUTORIALS.glob("*.md")):
+            print(f"{page.stem}: {draw_tutorial(page)}", flush=True)
+        return
     for scene in arguments.scenes or scene_files():
-        with tempfile.TemporaryDirectory() as folder:
-            command = [sys.executable, "-m", "ddg_warp", "run", scene, "--out", folder, "--force"]
-            try:
-                done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=arguments.limit)
-            except subprocess.TimeoutExpired:
-                print(f"{scene}: takes longer than {arguments.limit:g} s")
-                continue
-            picture = Path(folder) / "picture.png"
-            if not picture.exists():
-                print(f"{scene}: no picture: {done.stderr[-300:]}")
-                continue
-            with Image.open(picture) as image:
-                size = WIDTH, round(image.height * WIDTH / image.width)
-                small = image.convert("RGB").resize(size, Image.Resampling.LANCZOS)
-                small.quantize(64).save(GALLERY / f"{scene}.png", optimize=True)
-            print(f"{scene}: {'its checks pass' if done.returncode == 0 else 'A CHECK FAILS'}", flush=True)
+        print(f"{scene}: {draw_scene(scene, arguments.limit)}", flush=True)
 
 
 if __name__ == "__main__":
