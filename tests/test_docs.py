@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from ddg_warp.kernels.core import outcome
+
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "tools" / "docs"
 TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))
@@ -105,6 +107,12 @@ def test_readme():
     text = (ROOT / "README.md").read_text()
     assert len(text.splitlines()) <= 150
     assert expander().expand(expander().BLOCK.search((DOCS / "accuracy.md").read_text())[0]) in text
+
+
+def test_outcomes():
+    """Every outcome of a step that is no success has a remedy on the page of errors."""
+    text = (DOCS / "errors.md").read_text()
+    assert not [name for name in outcome.NAMES.values() if f"`{name}`" not in text and not name.startswith("converged")]
 
 
 @pytest.mark.slow
