@@ -173,13 +173,14 @@ def bytes_per_node(model, group) -> int:
     state = 3 * kind.dim + (10 if twist else 0) + (kind.strain_rows if kind.viscous else 0)
     iterate = 4 * kind.dim + (10 if twist else 0) + 2  # with predictor and energies
     factor, solver = kind.factor_rows, 2 * nb + 1
-    if has_natural_curvature(group) and kind.span == 2:
+    exact = has_natural_curvature(group) and kind.span == 2
+    if exact:
         solver += kind.geometric_rows
     constant = 2 * real + 1
     if kind.closed:
         solver += 3 * nb**2 + rod_elimination.kept_rows(kind)
     elif automatic(group) == "sweep":
-        sides = swept_ends(group)
+        sides = swept_ends(group, exact)
         kept = rod_sweep.kept_rows(kind, sides=sides)
         factor = max(factor, kept) if sides == 1 else factor + kept
     else:
