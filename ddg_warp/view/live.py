@@ -50,6 +50,7 @@ class Viewer:
     def __init__(self, model, *, port: int = PORT, host: str = "127.0.0.1", paused: bool = False, pace: float = 1.0):
         check_model("Viewer", model)
         argument_checks.flag("Viewer: paused", paused)
+        argument_checks.number("Viewer: pace", pace, "a number from 0 on", lambda value: value >= 0.0)
         self.model = model
         state = model.state()
         drawing = Drawing(model.curves, model.surfaces, model.worlds, state.points(), model.obstacles)
