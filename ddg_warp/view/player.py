@@ -82,7 +82,11 @@ class Player:
                 self.stage.fit(self.recording.frame(int(self._shown)))
             if self._changed or self._line.value != self._shown:
                 self._changed = False
-                self._draw(int(self._line.value))
+                try:
+                    self._draw(int(self._line.value))
+                except TrajectoryError:  # the run is writing: draw again from the file as it is afterwards
+                    self._changed = True
+                    self._extend()
             time.sleep(max(0.0, 1.0 / FRAME_RATE - (time.monotonic() - clock)))
 
     def _toggle(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader
 from ddg_warp.postprocess.fields import CELL_FIELDS, POINT_FIELDS
 from ddg_warp.view.drawing import Drawing, Frame, largest_force, value_range
 
+TRIES, WAIT = 20, 0.05  # attempts to open a file that is written to, and the time between two [s]
 SAMPLES = 16  # frames that give ranges of fields and forces
 SPEED = "speed [m/s]"
 NO_FIELD = "none"
@@ -50,13 +52,23 @@ class Recording:
         if self._reader is not None and version == self._version:
             return False
         count = 0 if self._reader is None else len(self._reader)
-        self.close()
-        self._reader, self._version = TrajectoryReader(self.path), version
-        reader = self._reader
+        self.close()  # first: HDF5 gives two readers of a file in a process the content as the first found it
+        self._version = None
+        self._reader = reader = self._open()
+        self._version = version
         if self.drawing is None and len(reader):
             worlds = int(np.prod(reader.points.shape[1:-2]))
             self.drawing = Drawing(reader.curves, reader.surfaces, worlds, reader.points[0], reader.obstacles)
         return len(reader) != count
+
+    def _open(self) -> TrajectoryReader:
+        """Open the file; wait while its writer is in the middle of a transaction."""
+        for _ in range(TRIES):
+            try:
+                return TrajectoryReader(self.path)
+            except TrajectoryError:
+                time.sleep(WAIT)
+        return TrajectoryReader(self.path)
 
     def __len__(self) -> int:
         return len(self._reader)

@@ -147,6 +147,30 @@ def test_a_run_that_goes_on_is_followed(run, tmp_path):
         assert np.array_equal(recording.frame(5).points, reader.points[5])
 
 
+@pytest.mark.parametrize("failures", [3, 100])
+def test_a_file_in_the_middle_of_a_write_is_opened_again(run, monkeypatch, failures):
+    from ddg_warp.view import recording as module
+
+    recording = module.Recording(run)
+    before, opened, attempts = recording.frame(3).points, module.TrajectoryReader, iter(range(failures))
+
+    def busy(path):
+        if next(attempts, None) is not None:
+            raise module.TrajectoryError("cut short")
+        return opened(path)
+
+    monkeypatch.setattr(module, "TrajectoryReader", busy)
+    monkeypatch.setattr(module, "WAIT", 0.0)
+    recording._version = None
+    for _ in range(failures // (module.TRIES + 1)):
+        with pytest.raises(module.TrajectoryError, match="cut short"):
+            recording.refresh()
+        with pytest.raises(module.TrajectoryError):
+            recording.frame(3)
+    assert recording.refresh() is False
+    assert np.array_equal(recording.frame(3).points, before)
+
+
 def test_a_saved_page_plays_without_python(run, page, tmp_path):
     from ddg_warp.run.cli import main
 
