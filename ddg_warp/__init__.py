@@ -7,7 +7,7 @@
 Describe a scene: `Scene`, `Circle`, `Ellipse`, `Rectangle`, `Ribbon`, `Stiffness`, `Material`, `Law`.
 Supports, motions, controls: `Motion`, `Grip`, `Controls`, `Samples`.
 Obstacles, fluid: `Plane`, `Sphere`, `Capsule`, `Box`, `Mesh`, `Viscous`, `Granular`.
-Run it: `simulate`, `Dynamics`, `Statics`, `PathAnalysis`, `StopCriterion`, `Displacement`, `Check`, `Recorder`, `bench`.
+Run it: `simulate`, `Viewer`, `Dynamics`, `Statics`, `PathAnalysis`, `StopCriterion`, `Displacement`, `Check`, `Recorder`, `bench`.
 Loops: `Integrator`, `AdaptiveStepper`, `statics`, `continuation`, `stability`.
 Query it: `Model`, `State`, `quantities`.
 Geometry, files: `meshes`, `rest_shapes`, `io`, `read_mesh`, `read_curves`.

@@ -49,7 +49,18 @@ class UserForces:
 
     user_forces: list[UserForce] = field(default_factory=list, init=False)
 
-    def add_nodal_force(self, name: str, function: Callable, **options) -> None:
+    def add_nodal_force(
+        self,
+        name: str,
+        function: Callable,
+        *,
+        parameters: Mapping | None = None,
+        potential: Callable | None = None,
+        rods=None,
+        nodes=None,
+        shells=None,
+        vertices=None,
+    ) -> None:
         """Add a user-defined force on nodes, evaluated with its derivatives in every iteration of steps and equilibria.
 
         The force of a node is `function(real)(x, v, t, p)`, a Warp function in the scalar type `real`. Here x is the position [m],
@@ -59,17 +70,29 @@ class UserForces:
         Args:
             name: name in parameters and reports; parameters are `name.parameter`.
             function: real -> Warp function with annotated arguments, vectors `wp.types.vector(3, real)`, and `p: typing.Any`.
-            options: `parameters`, values by name: a number, (nodes,), a vector (3,) or (nodes, 3). `potential`, real -> Warp function
-                of the same arguments whose negative derivative by x is the force [J], for `Model.energies`. `rods` with `nodes` of
-                each, and `shells` with `vertices`: where it acts, by default on all nodes of all rods and shells added so far. A joint
-                counts once.
+            parameters: values by name: a number, (nodes,), a vector (3,) or (nodes, 3).
+            potential: real -> Warp function of the same arguments, for `Model.energies` [J]. The force is its negative gradient.
+            rods, shells: where it acts, by default on all rods and shells added so far. A joint counts once.
+            nodes, vertices: nodes of each rod and vertices of each shell, by default all.
 
         Raises:
             SceneError: a wrong argument, or a function of other arguments; the message names it.
         """
-        self._add_user_force("add_nodal_force", name, function, False, **options)
+        where = rods, nodes, shells, vertices
+        self._add_user_force("add_nodal_force", name, function, False, parameters, potential, *where)
 
-    def add_pair_force(self, name: str, function: Callable, **options) -> None:
+    def add_pair_force(
+        self,
+        name: str,
+        function: Callable,
+        *,
+        parameters: Mapping | None = None,
+        potential: Callable | None = None,
+        rods=None,
+        nodes=None,
+        shells=None,
+        vertices=None,
+    ) -> None:
         """Add a user-defined force between all pairs of nodes, such as gravity or electrostatics.
 
         The force on a node from another is `function(real)(d, p, q)`, a Warp function in the scalar type `real`. Here d is the vector
@@ -77,7 +100,8 @@ class UserForces:
         the derivative by d symmetric, as for forces with a potential of the distance. The cost of an evaluation grows with the square
         of the number of nodes. `potential` is the energy of a pair. Other arguments as in `add_nodal_force`.
         """
-        self._add_user_force("add_pair_force", name, function, True, **options)
+        where = rods, nodes, shells, vertices
+        self._add_user_force("add_pair_force", name, function, True, parameters, potential, *where)
 
     def _add_user_force(
         self,
@@ -85,13 +109,12 @@ class UserForces:
         name,
         function,
         pairs,
-        *,
-        parameters=None,
-        potential=None,
-        rods=None,
-        nodes=None,
-        shells=None,
-        vertices=None,
+        parameters,
+        potential,
+        rods,
+        nodes,
+        shells,
+        vertices,
     ) -> None:
         argument_checks.text(f"{call}: name", name)
         if not name.isidentifier() or any(name == force.name for force in self.user_forces):

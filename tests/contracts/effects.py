@@ -13,10 +13,11 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.errors import SolverError
+from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.geometry import meshes
 from ddg_warp.kernels.densities.quadratic import quadratic
 from ddg_warp.run.simulate import simulate
+from tests.contracts import forces
 
 DEVICE, DT = "cpu", 1e-2
 RUBBER = ddg.Material(1e6, 0.3, 1000.0)
@@ -95,7 +96,12 @@ def observe_state(state) -> list:
     model = state.model
     names = [] if model.surfaces is None else model.surfaces.names.tolist()
     reactions = [(reaction.force, reaction.moment) for reaction in model.reactions(state)]
+    try:
+        named = model.reactions(state)["left"].force
+    except SceneError:  # no support has the name
+        named = None
     return [
+        named,
         state.points(),
         state.velocities(),
         state.angles(),
@@ -184,17 +190,21 @@ def two_clamped_rods(scene: ddg.Scene) -> None:
 
 
 LIFT = ddg.Motion(lambda t: (0.0, 0.0, t), lambda t: t)
-scene_call("clamp", {"rods": 0}, {"rods": [0, 1], "edges": [1], "motion": LIFT}, two_rods)
+scene_call("clamp", {"rods": 0}, {"rods": [0, 1], "edges": [1], "motion": LIFT, "name": "left"}, two_rods)
 scene_call("clamp_end", {"rods": 0}, {
-    "rods": [0, 1], "end": "last", "motion": LIFT, "components": "yz", "tangent": (1.0, 0.1, 0.0), "director": (0.0, 1.0, 0.5)},
+    "rods": [0, 1], "end": "last", "motion": LIFT, "components": "yz", "name": "left",
+    "tangent": (1.0, 0.1, 0.0), "director": (0.0, 1.0, 0.5)},
     two_rods)  # fmt: skip
 scene_call(
-    "fix", {"rods": 0, "nodes": [0]}, {"rods": [0, 1], "nodes": [1], "components": "xy", "motion": LIFT}, two_rods
+    "fix",
+    {"rods": 0, "nodes": [0]},
+    {"rods": [0, 1], "nodes": [1], "components": "xy", "motion": LIFT, "name": "left"},
+    two_rods,
 )
 scene_call(
     "fix_twist",
     {"rods": 0, "edges": [2]},
-    {"rods": [0, 1], "edges": [3], "motion": ddg.Motion(angle=lambda t: 9.0 * t)},
+    {"rods": [0, 1], "edges": [3], "motion": ddg.Motion(angle=lambda t: 9.0 * t), "name": "left"},
     two_clamped_rods,
 )
 
@@ -369,14 +379,31 @@ scene_call("add_shell", SHEET | {"thickness": 0.05, "material": RUBBER}, {
 scene_call(
     "hold",
     {"shell": 0, "vertices": [0, 1, 2]},
-    {"shell": 1, "vertices": [0, 2], "components": "z", "motion": LIFT},
+    {"shell": 1, "vertices": [0, 2], "components": "z", "motion": LIFT, "name": "left"},
     two_sheets,
 )
 scene_call("clamp_boundary", {"shell": 0, "vertices": [0, 1, 2]}, {
-    "shell": 1, "vertices": [0, 1], "components": "z", "motion": LIFT}, two_sheets)  # fmt: skip
+    "shell": 1, "vertices": [0, 1], "components": "z", "motion": LIFT, "name": "left"}, two_sheets)  # fmt: skip
 scene_call("symmetry", {"shell": 0, "vertices": [0, 1, 2], "axis": "y"}, {
     "shell": 1, "vertices": [0, 1], "axis": Change("y", {"vertices": [0, 3, 6]}, "x", refused=True),
-    "motion": ddg.Motion(lambda t: (0, t, 0))}, two_sheets)  # fmt: skip
+    "motion": ddg.Motion(lambda t: (0, t, 0)), "name": "left"}, two_sheets)  # fmt: skip
+
+
+def rods_and_sheet(scene: ddg.Scene) -> None:
+    """Add two clamped rods and a clamped sheet."""
+    two_clamped_rods(scene)
+    clamped_sheet(scene)
+
+
+USER = {"name": "tether", "rods": 0, "parameters": {"stiffness": 5.0, "strength": 1.0}}
+USER_ROWS = {
+    "name": Change("a tether", refused=True), "parameters": {"stiffness": 6.0, "strength": 2.0}, "rods": [0, 1], "nodes": [3, 5],
+    "shells": [0], "vertices": Change([7, 8], {"shells": [0]}),
+}  # fmt: skip
+scene_call("add_nodal_force", USER | {"function": forces.spring}, USER_ROWS | {
+    "function": forces.stiffer_spring, "potential": forces.spring_energy}, rods_and_sheet)  # fmt: skip
+scene_call("add_pair_force", USER | {"function": forces.bond}, USER_ROWS | {
+    "function": forces.stiffer_bond, "potential": forces.bond_energy}, rods_and_sheet)  # fmt: skip
 VERTEX_LOADS = {"shell": 1, "amplitude": _half}
 
 
@@ -438,11 +465,14 @@ scene_call("add_axisymmetric_shell", {"points": DOME, "thickness": 0.05, "materi
     lambda s: None, lambda s: s.hold_ring(0, [4]))  # fmt: skip
 SIDE = ddg.Motion(lambda t: (t, 0, 0))
 scene_call(
-    "hold_ring", {"shell": 0, "nodes": [0]}, {"shell": 1, "nodes": [1], "components": "z", "motion": SIDE}, two_tubes
+    "hold_ring",
+    {"shell": 0, "nodes": [0]},
+    {"shell": 1, "nodes": [1], "components": "z", "motion": SIDE, "name": "left"},
+    two_tubes,
 )
 scene_call("clamp_ring", {"shell": 0, "end": "first"}, {
-    "shell": 1, "end": "last", "components": "z", "tangent": (0.1, 1.0), "motion": SIDE}, two_tubes)  # fmt: skip
-scene_call("symmetry_ring", {"shell": 0, "end": "first"}, {"shell": 1, "end": "last"}, two_tubes)
+    "shell": 1, "end": "last", "components": "z", "tangent": (0.1, 1.0), "motion": SIDE, "name": "left"}, two_tubes)  # fmt: skip
+scene_call("symmetry_ring", {"shell": 0, "end": "first"}, {"shell": 1, "end": "last", "name": "left"}, two_tubes)
 scene_call(
     "add_ring_force",
     {"shell": 0, "nodes": [0], "force": (1, 0)},
@@ -612,4 +642,4 @@ CALLS["Displacement"] = Call(ddg.Displacement, lambda terms: analyse(ddg.PathAna
     watch={"tip": ddg.Displacement(terms)}, stop=ddg.StopCriterion(
     steps=1))), {"terms": ((5, "z", 1.0),)}, {"terms": ((5, "z", -1.0), (4, "y", 1.0))})  # fmt: skip
 CALLS["Displacement.of"] = Call(ddg.Displacement.of, lambda **named: analyse(ddg.PathAnalysis(watch={"tip": ddg.Displacement.of(
-    **named)}, stop=ddg.StopCriterion(steps=1))), {"row": 5, "axis": "z"}, {"row": 4, "axis": "y", "weight": 2.0})  # fmt: skip
+    **named)}, stop=ddg.StopCriterion(steps=1))), {"point": 5, "axis": "z"}, {"point": 4, "axis": "y", "weight": 2.0})  # fmt: skip

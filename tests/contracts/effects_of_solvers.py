@@ -194,6 +194,8 @@ def observe_equilibrium(kind: str = "arc", way=None, controls=None, cuts: bool =
     if named.get("rest"):
         made = made.scene.build(DEVICE, "float64")
     options = {name: named.pop(name) for name in [each.name for each in _fields()] if name in named}
+    if "progress" in named:
+        return statics.solve(made, progress=named["progress"]).points()
     solver = statics.Equilibrium(made, StaticsOptions(**options))
     state = named.pop("state", None) or made.state()
     result = solver.load(state, controls=controls, **named)
@@ -214,7 +216,10 @@ def _fields():
 
 
 PUSH = ddg.Controls(forces=np.full((6, 3), 0.1))
+# Progress shows after ten seconds.
+PROGRESS = Change("no", refused=True)
 CALLS["statics.solve"] = Call(statics.solve, observe_equilibrium, {}, {
+    "progress": PROGRESS,
     "state": Change("moved", {"kind": "arch", "end": 0.01}), "controls": PUSH, "load_steps": 2,
     "start": Change(0.5, {"load_steps": 2}), "end": 0.5, "way": [],
     "rest": Change({0: {"angle": np.full(16, 0.1)}}, {"kind": "sheet"}), "rtol": 1e-2,
@@ -281,6 +286,7 @@ def observe_trace(**named) -> list:
 
 
 CALLS["trace"] = Call(continuation.Continuation.trace, observe_trace, {"stop": ddg.StopCriterion(steps=3)}, {
+    "progress": PROGRESS,
     "state": True, "start": 0.01, "direction": -1, "stop": ddg.StopCriterion(steps=2)})  # fmt: skip
 CALLS["Stop at limit points"] = Call(
     ddg.StopCriterion, lambda **named: observe_path(trace={"stop": ddg.StopCriterion(**named)}, max_step=0.3), {

@@ -87,6 +87,7 @@ def test_every_public_call_is_in_the_table():
         "Recorder",
         "SceneError",
         "SceneWarning",
+        "Simulator",
         "SolverError",
         "State",
         "Viewer",
