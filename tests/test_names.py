@@ -268,3 +268,18 @@ def test_rods_of_unequal_counts_equal_those_added_one_by_one(device):
     with pytest.raises(ddg.SceneError, match="has no length"):
         scene.add_rods([straight(4), np.zeros((3, 3))], **SOFT)
         scene.build(device)
+
+
+def test_wrenches_of_steps_go_by_name_and_handle(device):
+    scene = ddg.Scene()
+    cable = scene.add_rod(straight(11), **SOFT)
+    left = scene.clamp(cable, edges=[0], name="left")
+    scene.clamp(cable, edges=[-1], name="right")
+    integrator = ddg.Integrator(scene.build(device))
+    integrator.watch_wrenches()
+    integrator.step(integrator.model.state(), 0.01)
+    wrenches = integrator.wrenches()
+    assert wrenches["left"] is wrenches[left] is wrenches[0]
+    assert (wrenches["right"].force == wrenches[1].force).all()
+    with pytest.raises(ddg.SceneError, match="did you mean 'right'"):
+        wrenches["rihgt"]

@@ -66,16 +66,17 @@ def reactions(model, state, point=None, factor: float = 1.0) -> Reactions:
         model.touch.evaluate(state.coupled.q, state.coupled.rate)
         loads[-1] = loads[-1] + model.touch.terms.forces.numpy().astype(float).ravel()
     result = model.static_wrenches.at(state, loads)
-    if point is not None:
-        result = [
-            Reaction(
-                each.force,
-                each.moment + np.cross(each.point - point, each.force),
-                np.broadcast_to(point, each.point.shape),
-            )
-            for each in result
-        ]
-    return Reactions(result, model.scene)
+    if point is None:
+        return result
+    about = [
+        Reaction(
+            each.force,
+            each.moment + np.cross(each.point - point, each.force),
+            np.broadcast_to(point, each.point.shape),
+        )
+        for each in result
+    ]
+    return Reactions(about, model.scene)
 
 
 @dataclass(frozen=True)

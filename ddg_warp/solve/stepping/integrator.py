@@ -27,7 +27,7 @@ from ddg_warp.solve.stepping.local_error import VelocityChange
 from ddg_warp.solve.stepping.rod_step import RodStep
 from ddg_warp.solve.stepping.state_buffers import StateBuffer
 from ddg_warp.solve.stepping.world_reset import WorldReset, outcomes
-from ddg_warp.solve.stepping.wrenches import Reaction, Wrenches
+from ddg_warp.solve.stepping.wrenches import Reactions, Wrenches
 from ddg_warp.timers import timer
 
 FAILURES = ("raise", "flag")
@@ -489,10 +489,11 @@ class Integrator:
             self._graphs.clear()
         return self.watched_wrenches
 
-    def wrenches(self) -> list[Reaction]:
+    def wrenches(self) -> Reactions:
         """Return the force and moment that every support, grip and obstacle exerted in the last step. Reads from the device.
 
-        They are ordered as in `Model.reactions`, and hold inertia, damping and all forces at the support; see `Wrenches`.
+        Indices, names and handles give one of them, as of `Model.reactions`. They hold inertia, damping and all forces at the support;
+        see `Wrenches`.
 
         Raises:
             SceneError: `watch_wrenches` was not called before the step.

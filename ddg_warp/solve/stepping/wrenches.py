@@ -156,7 +156,7 @@ class Wrenches:
         for references, state in zip(self._references, [*after.groups, after.coupled], strict=False):
             references.shift(state, self.force, self.moment, self.point)
 
-    def at(self, state, loads: list[np.ndarray]) -> list[Reaction]:
+    def at(self, state, loads: list[np.ndarray]) -> Reactions:
         """Return the reactions at a state without inertia and damping.
 
         Args:
@@ -168,12 +168,12 @@ class Wrenches:
         self.sum(state, None)
         return self.values()
 
-    def values(self) -> list[Reaction]:
+    def values(self) -> Reactions:
         """Return the wrench of every support. Reads from the device."""
         arrays = [array.numpy().astype(float) for array in (self.force, self.moment, self.point)]
-        if self._model.worlds == 1:
-            return [Reaction(*(values[0, i] for values in arrays)) for i in range(self.force.shape[1])]
-        return [Reaction(*(values[:, i] for values in arrays)) for i in range(self.force.shape[1])]
+        world = 0 if self._model.worlds == 1 else slice(None)
+        reactions = [Reaction(*(values[world, i] for values in arrays)) for i in range(self.force.shape[1])]
+        return Reactions(reactions, self._model.scene)
 
 
 class _Runs:
