@@ -57,6 +57,8 @@ def test_shallow_truss_snaps_through(device):
     assert path.values("drop")[-1] == pytest.approx(2.3 * height, rel=1e-12)
     assert np.abs(path.values("sway")).max() < 1e-12
     assert not path.bifurcations
+    assert repr(path).startswith(f"<Path of {len(path)} equilibria from load 0 to ")
+    assert repr(path.limit_points[0]).startswith("<Limit point at load ") and " m, " in repr(path.limit_points[0])
     limit = np.sqrt(length ** (2.0 / 3.0) - 1.0)
     assert [height - point.values["drop"] for point in path.limit_points] == pytest.approx([limit, -limit], abs=1e-7)
     loads = [point.load for point in path.limit_points]

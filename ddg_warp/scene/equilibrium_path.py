@@ -93,7 +93,7 @@ def watched_displacements(call: str, watch, planar: bool) -> dict[str, Displacem
     return result
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Point:
     """Equilibrium of a path.
 
@@ -122,13 +122,18 @@ class Point:
     iterations: int = 0
     mode_displacements: np.ndarray | None = None
 
+    def __repr__(self) -> str:
+        watched = "".join(f", {name} {value:.6g} m" for name, value in self.values.items())
+        stability = "stable" if self.stable else f"{self.negative} negative eigenvalues"
+        return f"<{self.kind.capitalize()} at load {self.load:.6g}{watched}, {stability}>"
+
     @property
     def stable(self) -> bool:
         """True if the second variation of the potential is positive."""
         return self.negative == 0
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Path:
     """Equilibria in order along a path.
 
@@ -142,6 +147,10 @@ class Path:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def __repr__(self) -> str:
+        between = f" from load {self.points[0].load:.6g} to {self.points[-1].load:.6g}" if self.points else ""
+        return f"<Path of {len(self)} equilibria{between}; ended by {self.outcome or 'nothing yet'}>"
 
     @property
     def load(self) -> np.ndarray:
