@@ -63,6 +63,28 @@ def attraction_energy(real):
     return energy
 
 
+@cache
+def swirl(real):
+    V = wp.types.vector(3, real)
+
+    @wp.func
+    def force(d: V, p: Any, q: Any):
+        return wp.cross(p.axis, d)
+
+    return force
+
+
+@cache
+def push(real):
+    V = wp.types.vector(3, real)
+
+    @wp.func
+    def force(d: V, p: Any, q: Any):
+        return p.mass * d
+
+    return force
+
+
 def rod_scene(gravity=(0.0, 0.0, 0.0)) -> ddg.Scene:
     scene = ddg.Scene(gravity=gravity)
     scene.add_rod(LINE, section=SOFT)
@@ -393,6 +415,24 @@ def test_wrong_forces_are_refused(arguments, message):
     name, function, *options = arguments
     with pytest.raises(ddg.SceneError, match=message):
         rod_scene().add_nodal_force(name, function, **(options[0] if options else {"parameters": GOOD}))
+
+
+@pytest.mark.parametrize(
+    ("function", "parameters", "message"),
+    [
+        (swirl, {"axis": (0.0, 0.0, 1.0)}, "derivative of the force by d is not symmetric"),
+        (push, {"mass": np.arange(1.0, 10.0)}, "forces on the two nodes of a pair are not opposite"),
+        (attraction, {"mass": 1.0, "strength": np.inf}, "finite"),
+    ],
+)
+def test_pair_forces_without_balance_are_refused(device, function, parameters, message):
+    scene = ddg.Scene()
+    scene.add_rod(
+        np.linspace((0.0, 0.0, 0.0), (1.0, 0.5, 0.0), 9), section=ddg.Circle(0.01), material=ddg.Material(1e6)
+    )
+    with pytest.raises(ddg.SceneError, match=message):
+        scene.add_pair_force("odd", function, parameters=parameters)
+        scene.build(device)
 
 
 def test_unsupported_uses_are_refused(device):

@@ -4,7 +4,11 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import argument_checks
-from ddg_warp.kernels.forces.user_force import energy_kernel, parameter_struct
+from ddg_warp.errors import SceneError
+from ddg_warp.kernels.forces.user_force import energy_kernel, pair_check_kernel, parameter_struct
+
+TRIED = 8  # nodes whose pairs are checked
+UNBALANCED = 1e-3  # error of opposite forces and of symmetric derivatives, relative
 
 
 class UserForceArrays:
@@ -32,6 +36,41 @@ class UserForceArrays:
         self.parameters = wp.zeros(shape, dtype=parameter_struct(self.layout, real), device=device)
         self._real = real
         self._upload()
+        if force.pairs:
+            self._check_pairs(host.rest[self.blocks[:TRIED]])
+
+    def _check_pairs(self, x: np.ndarray) -> None:
+        """Refuse a pair force that is not opposite on the other node or has no symmetric derivative, by pairs of nodes at x (n, 3).
+
+        Nodes at one point are left out, as a force may be infinite there.
+        """
+        first, second = np.triu_indices(len(x), 1)
+        distinct = np.linalg.norm(x[first] - x[second], axis=1) > 0.0
+        pairs, device = np.stack([first[distinct], second[distinct]]).astype(np.int32), self.parameters.device
+        if not pairs.size:
+            return
+        points = wp.array(x, dtype=wp.types.vector(3, self._real), device=device)
+        out = wp.zeros((4, pairs.shape[1]), dtype=self._real, device=device)
+        kernel = pair_check_kernel(self.force.function, self.layout, self._real)
+        inputs = [points, self.parameters, wp.array(pairs, dtype=int, device=device)]
+        wp.launch(kernel, pairs.shape[1], inputs, [out], device=device)
+        values = out.numpy().astype(float)
+        i, j = pairs[:, np.argmax(~np.isfinite(values).all(0))]
+        if not np.isfinite(values).all():
+            raise SceneError(
+                f"add_pair_force {self.name!r}: the force between its nodes {i} and {j} is not finite at rest"
+            )
+        force, sum_of_both, derivative, skew = values.max(1)
+        if sum_of_both > UNBALANCED * force:
+            raise SceneError(
+                f"add_pair_force {self.name!r}: forces on the two nodes of a pair are not opposite; return a force that changes "
+                "its sign if d does and p and q are exchanged"
+            )
+        if skew > UNBALANCED * derivative:
+            raise SceneError(
+                f"add_pair_force {self.name!r}: the derivative of the force by d is not symmetric; return a force along d that "
+                "depends on its length"
+            )
 
     @property
     def numbers(self) -> wp.array:

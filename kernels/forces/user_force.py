@@ -422,3 +422,50 @@ def energy_kernel(potential, layout: tuple[tuple[str, int], ...], pairs: bool, r
             out[w, k] = function(x, V(), time, p)
 
     return energy
+
+
+@cache
+def pair_check_kernel(function, layout: tuple[tuple[str, int], ...], real):
+    """Build the kernel `check` of pairs of nodes (2, pairs): write four sizes of each.
+
+    They are the force, the sum of the forces on both nodes, the derivative by the distance vector, and its asymmetry.
+    """
+    V, M, struct, force = (
+        wp.types.vector(3, real),
+        wp.types.matrix((3, 3), real),
+        parameter_struct(layout, real),
+        function(real),
+    )
+
+    @wp.func
+    def along(d: V, p: struct, q: struct, w: V):
+        return wp.dot(w, force(d, p, q))
+
+    derivative = wp.grad(along)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def check(
+        x: wp.array(dtype=V),
+        parameters: wp.array2d(dtype=struct),
+        pairs: wp.array2d(dtype=int),
+        out: wp.array2d(dtype=real),
+    ):
+        pair = wp.tid()
+        i, j = pairs[0, pair], pairs[1, pair]
+        p, q = parameters[0, i], parameters[0, j]
+        d = x[j] - x[i]
+        f = force(d, p, q)
+        K = M()
+        for row in range(3):
+            unit = V()
+            unit[row] = real(1.0)
+            by_d, _p, _q, _w = derivative(d, p, q, unit)
+            for c in range(3):
+                K[row, c] = by_d[c]
+        skew = K - wp.transpose(K)
+        out[0, pair] = wp.length(f)
+        out[1, pair] = wp.length(f + force(-d, q, p))
+        out[2, pair] = wp.sqrt(wp.ddot(K, K))
+        out[3, pair] = wp.sqrt(wp.ddot(skew, skew))
+
+    return check
