@@ -1,5 +1,6 @@
 """User-defined forces on nodes and between all pairs: closed forms, gradients, worlds, refusals."""
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -59,6 +60,28 @@ def attraction_energy(real):
     @wp.func
     def energy(d: V, p: Any, q: Any):
         return -p.strength * p.mass * q.mass / wp.length(d)
+
+    return energy
+
+
+@cache
+def twice_tether_energy(real):
+    V, single = wp.types.vector(3, real), tether_energy(real)
+
+    @wp.func
+    def energy(x: V, v: V, t: real, p: Any):
+        return real(2.0) * single(x, v, t, p)
+
+    return energy
+
+
+@cache
+def twice_attraction_energy(real):
+    V, single = wp.types.vector(3, real), attraction_energy(real)
+
+    @wp.func
+    def energy(d: V, p: Any, q: Any):
+        return real(2.0) * single(d, p, q)
 
     return energy
 
@@ -432,6 +455,15 @@ def test_pair_forces_without_balance_are_refused(device, function, parameters, m
     )
     with pytest.raises(ddg.SceneError, match=message):
         scene.add_pair_force("odd", function, parameters=parameters)
+        scene.build(device)
+
+
+@pytest.mark.parametrize("potential", [twice_tether_energy, twice_attraction_energy])
+def test_potentials_of_another_force_are_refused(device, potential):
+    scene = both_forces(rod_scene())
+    number = int(potential is twice_attraction_energy)
+    scene.user_forces[number] = replace(scene.user_forces[number], potential=potential)
+    with pytest.raises(ddg.SceneError, match="not the negative gradient of the potential"):
         scene.build(device)
 
 

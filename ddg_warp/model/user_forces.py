@@ -5,7 +5,12 @@ import warp as wp
 
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
-from ddg_warp.kernels.forces.user_force import energy_kernel, pair_check_kernel, parameter_struct
+from ddg_warp.kernels.forces.user_force import (
+    energy_kernel,
+    pair_check_kernel,
+    parameter_struct,
+    potential_check_kernel,
+)
 
 TRIED = 8  # nodes whose pairs are checked
 UNBALANCED = 1e-3  # error of opposite forces and of symmetric derivatives, relative
@@ -38,6 +43,28 @@ class UserForceArrays:
         self._upload()
         if force.pairs:
             self._check_pairs(host.rest[self.blocks[:TRIED]])
+        if force.potential:
+            self._check_potential(host.rest[self.blocks[:TRIED]])
+
+    def _check_potential(self, x: np.ndarray) -> None:
+        """Refuse a potential of another force, by nodes near x (n, 3)."""
+        device, size = self.parameters.device, max(float(np.ptp(x, axis=0).max()), 1e-3)
+        x = (
+            x + 0.01 * size * np.array([1.0, -2.0, 3.0]) * np.arange(1, len(x) + 1)[:, None]
+        )  # springs have no force at rest
+        points = wp.array(x, dtype=wp.types.vector(3, self._real), device=device)
+        out = wp.zeros((2, len(x)), dtype=self._real, device=device)
+        kernel = potential_check_kernel(
+            self.force.function, self.force.potential, self.layout, self.force.pairs, self._real
+        )
+        wp.launch(kernel, len(x), [points, self.parameters], [out], device=device)
+        force, error = out.numpy().astype(float).max(1)
+        if not error <= UNBALANCED * force:
+            call = "add_pair_force" if self.force.pairs else "add_nodal_force"
+            raise SceneError(
+                f"{call} {self.name!r}: the force is not the negative gradient of the potential; correct one of them, or leave out "
+                "potential="
+            )
 
     def _check_pairs(self, x: np.ndarray) -> None:
         """Refuse a pair force that is not opposite on the other node or has no symmetric derivative, by pairs of nodes at x (n, 3).

@@ -469,3 +469,32 @@ def pair_check_kernel(function, layout: tuple[tuple[str, int], ...], real):
         out[3, pair] = wp.sqrt(wp.ddot(skew, skew))
 
     return check
+
+
+@cache
+def potential_check_kernel(function, potential, layout: tuple[tuple[str, int], ...], pairs: bool, real):
+    """Build the kernel `check` of nodes, or of a node and the one before: write the sizes of force and error of the potential.
+
+    The error is the difference of the force and the negative gradient of the potential (2, nodes), at rest and t = 0.
+    """
+    V, struct, force, energy = wp.types.vector(3, real), parameter_struct(layout, real), function(real), potential(real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def check(x: wp.array(dtype=V), parameters: wp.array2d(dtype=struct), out: wp.array2d(dtype=real)):
+        k = wp.tid()
+        p = parameters[0, k]
+        if wp.static(pairs):
+            if k > 0:
+                q = parameters[0, k - 1]
+                d = x[k - 1] - x[k]
+                f = force(d, p, q)
+                by_d, _p, _q = wp.grad(energy)(d, p, q)
+                out[0, k] = wp.length(f)
+                out[1, k] = wp.length(f - by_d)
+        else:
+            f = force(x[k], V(), real(0.0), p)
+            by_x, _v, _t, _p = wp.grad(energy)(x[k], V(), real(0.0), p)
+            out[0, k] = wp.length(f)
+            out[1, k] = wp.length(f + by_x)
+
+    return check
