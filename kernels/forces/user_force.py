@@ -257,6 +257,41 @@ def nodal_kernels(function, layout: tuple[tuple[str, int], ...], real):
 
 
 @cache
+def pair_functions(function, layout: tuple[tuple[str, int], ...], real):
+    """Return the device functions of a pair force.
+
+    `force(d, p, q)`.
+    `derivative(d, p, q, w)`: the gradient of w . force by all arguments.
+    `jacobian(d, p, q)`: the derivative of the force by d.
+    """
+    V, M, struct, force = (
+        wp.types.vector(3, real),
+        wp.types.matrix((3, 3), real),
+        parameter_struct(layout, real),
+        function(real),
+    )
+
+    @wp.func
+    def along(d: V, p: struct, q: struct, w: V):
+        return wp.dot(w, force(d, p, q))
+
+    derivative = wp.grad(along)
+
+    @wp.func
+    def jacobian(d: V, p: struct, q: struct):
+        result = M()
+        for row in range(3):
+            unit = V()
+            unit[row] = real(1.0)
+            by_d, _p, _q, _w = derivative(d, p, q, unit)
+            for c in range(3):
+                result[row, c] = by_d[c]
+        return result
+
+    return force, derivative, jacobian
+
+
+@cache
 def pair_kernels(function, layout: tuple[tuple[str, int], ...], real, linear):
     """Build the kernels of a pair force; one thread sums over all other nodes, in order.
 
@@ -266,14 +301,9 @@ def pair_kernels(function, layout: tuple[tuple[str, int], ...], real, linear):
     `pull`: its reverse.
     """
     V, M, H = wp.types.vector(3, real), wp.types.matrix((3, 3), real), wp.types.vector(3, linear)
-    struct, numbers, force = parameter_struct(layout, real), numbers_function(layout, real), function(real)
+    struct, numbers = parameter_struct(layout, real), numbers_function(layout, real)
+    force, derivative, jacobian = pair_functions(function, layout, real)
     P = wp.types.vector(sum(size for _, size in layout), real)
-
-    @wp.func
-    def along(d: V, p: struct, q: struct, w: V):
-        return wp.dot(w, force(d, p, q))
-
-    derivative = wp.grad(along)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def evaluate(
@@ -353,12 +383,7 @@ def pair_kernels(function, layout: tuple[tuple[str, int], ...], real, linear):
         s = M()
         if neighbour != k:
             d = q[nodes[neighbour] + w * blocks] - q[nodes[k] + w * blocks]
-            for row in range(3):
-                unit = V()
-                unit[row] = real(1.0)
-                by_d, _p, _q, _w = derivative(d, parameters[w, k], parameters[w, neighbour], unit)
-                for c in range(3):
-                    s[row, c] = -by_d[c]
+            s = -jacobian(d, parameters[w, k], parameters[w, neighbour])
         out[w, k, neighbour] = s
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -430,18 +455,8 @@ def pair_check_kernel(function, layout: tuple[tuple[str, int], ...], real):
 
     They are the force, the sum of the forces on both nodes, the derivative by the distance vector, and its asymmetry.
     """
-    V, M, struct, force = (
-        wp.types.vector(3, real),
-        wp.types.matrix((3, 3), real),
-        parameter_struct(layout, real),
-        function(real),
-    )
-
-    @wp.func
-    def along(d: V, p: struct, q: struct, w: V):
-        return wp.dot(w, force(d, p, q))
-
-    derivative = wp.grad(along)
+    V, struct = wp.types.vector(3, real), parameter_struct(layout, real)
+    force, _, jacobian = pair_functions(function, layout, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def check(
@@ -455,13 +470,7 @@ def pair_check_kernel(function, layout: tuple[tuple[str, int], ...], real):
         p, q = parameters[0, i], parameters[0, j]
         d = x[j] - x[i]
         f = force(d, p, q)
-        K = M()
-        for row in range(3):
-            unit = V()
-            unit[row] = real(1.0)
-            by_d, _p, _q, _w = derivative(d, p, q, unit)
-            for c in range(3):
-                K[row, c] = by_d[c]
+        K = jacobian(d, p, q)
         skew = K - wp.transpose(K)
         out[0, pair] = wp.length(f)
         out[1, pair] = wp.length(f + force(-d, q, p))

@@ -1,4 +1,4 @@
-"""Forces of a step on the nodes of a rod group or of the coupled system, beside elements and contact."""
+"""Forces of a step on the nodes of a rod group or of the coupled system that are neither of elements nor of contact."""
 
 from typing import ClassVar
 
