@@ -3,11 +3,9 @@
 import numpy as np
 
 import ddg_warp as ddg
-from ddg_warp.io.rod_tubes import SIDES, tube_faces, tube_points
 from ddg_warp.solve.equilibrium.tangent import Tangent
 
 HALVED = 0.1  # allowed fraction of failed solves, whose steps are then halved
-GREY = 0.75  # brightness of obstacles in pictures
 CROWDED = "nothing passes through anything"
 
 
@@ -139,33 +137,3 @@ def smallest_gap(model, state) -> float:
     """Return the smallest gap within the activation distance [m], or that distance if there is none."""
     gap = model.contacts(state).gap
     return float(gap.min()) if len(gap) else float(model.scene.contact_settings.range)
-
-
-def tubes(model, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (n, 3) [m] and triangles (t, 3) of all rods of the first world as open tubes of actual thickness."""
-    counts, closed = np.asarray(model.curves.counts), np.asarray(model.curves.closed)
-    radius = [np.full(batch.rods * batch.nodes, np.max(batch.section.radius)) for batch in model.scene.batches]
-    sizes, corners = tube_faces(counts, closed)
-    quads = corners[: sizes[sizes == 4].sum()].reshape(-1, 4)
-    triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    return tube_points(points, counts, closed, np.concatenate(radius)), triangles
-
-
-def colored_tubes(model, points: np.ndarray, t: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `tubes` with RGB of each triangle (t, 3), one color a rod, and grey obstacles at a time [s]."""
-    rods = tubes(model, points)
-    rod = np.searchsorted(SIDES * np.cumsum(model.curves.counts), rods[1][:, 0], side="right")
-    bodies = [rods]
-    if model.obstacles is not None:
-        moved = [each.motion.place(t, each.shape.points) for each in model.scene.obstacles if each.motion is not None]
-        bodies.append(model.obstacles.surface(np.concatenate(moved) if moved else None))
-    points, triangles = joined(*bodies)
-    return points, triangles, np.concatenate([colors(model)[rod], np.full((len(triangles) - len(rod), 3), GREY)])
-
-
-def joined(*bodies: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return one mesh of several."""
-    first = np.cumsum([0] + [len(points) for points, _ in bodies])
-    return np.concatenate([points for points, _ in bodies]), np.concatenate(
-        [triangles + offset for (_, triangles), offset in zip(bodies, first[:-1], strict=True)]
-    )

@@ -9,6 +9,7 @@ slide and rotate, and load parameter 1 is 2 pi D / R. The limits then depend on 
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp.io.colors import on_scale
 
 RADIUS = 1.0  # m
 THICKNESS = 2e-5  # m; the cap is shallow
@@ -72,6 +73,36 @@ def check(result) -> list[ddg.Check]:
         ddg.Check(name, load, limit, tolerance, SOURCE, relative=True)
         for name, load, limit in zip(names, loads, limits, strict=False)
     ]
+
+
+def picture(result, frames) -> dict:
+    """Draw a half of the dome before, at the first limit load, and at the end, with magnified heights, and the path."""
+    limits = [point for point in result.path.points if point.kind == "limit point"]
+    chosen = [result.path.points[0], *limits[:1], result.path.points[-1]]
+    rest = result.path.points[0].state.points()
+    across = float(rest[:, 0].max())
+    heights = float(f"{0.3 * across / np.ptp(rest[:, 2]):.1g}")
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 49)  # the half beyond the plane y = 0 is seen from its cut
+    shapes, cells = {}, None
+    for number, point in enumerate(chosen):
+        r, _, z = point.state.points().T
+        z = heights * (z - rest[:, 2].min()) + 0.45 * across * (len(chosen) - 1 - number)
+        around = [np.outer(-np.sin(angle), r), np.outer(np.cos(angle), r), np.tile(z, (len(angle), 1))]
+        shapes[float(number)] = np.stack(around, -1).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(len(angle) - 1), np.arange(len(rest) - 1), indexing="ij")
+    first = (i * len(rest) + j).ravel()
+    after = first + len(rest)
+    cells = np.concatenate([np.stack([first, after, after + 1], 1), np.stack([first, after + 1, first + 1], 1)])
+    return {
+        "points_by_time": [(k, np.zeros_like(rest) + shapes[k][0]) for k in shapes],
+        "bodies": {
+            k: (points, cells, np.tile(on_scale(np.array([k]), 0.0, 2.0), (len(cells), 1)))
+            for k, points in shapes.items()
+        },
+        "fixed": None,
+        "names": [f"load {point.load:.3g}" for point in chosen],
+        "note": f"heights times {heights:,.0f}, one dome above the other",
+    }
 
 
 def benchmark() -> ddg.bench.Study:

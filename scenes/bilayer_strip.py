@@ -16,6 +16,7 @@ import numpy as np
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.model.rest_shapes import bilayer_curvature, grown_metric, principal_form
+from ddg_warp.scenes import _pictures
 
 LENGTH = 1.0  # m
 THICKNESS = 0.004  # m, of both layers together
@@ -111,6 +112,20 @@ def check(result) -> list[ddg.Check]:
             relative=True,
         )
     ]
+
+
+def picture(result, frames) -> dict:
+    """Draw the flat strip and the curled one, colored by its elastic energy."""
+    drawn, kappa = result.model.scene.shells[0].points, rest_curvature(result.model)
+    along = np.arctan2(kappa * drawn[:, 0], 1.0 - kappa * drawn[:, 2]) / kappa
+    flat = np.stack([along, drawn[:, 1], 0.0 * along], -1)
+    return {
+        "points_by_time": [(0.0, flat), (1.0, result.state.points())],
+        "values": _pictures.at_points(result.model, result.state, "shell_energy"),
+        "label": "elastic energy per area [J/m²]",
+        "note": "grey: flat, before growth",
+        "fixed": None,
+    }
 
 
 def benchmark() -> ddg.bench.Study:

@@ -161,6 +161,7 @@ def picture(result, frames) -> dict:
     low, high = np.array([-0.02, -3.0 * AMPLITUDE]), np.array([LENGTH, 3.0 * AMPLITUDE])
     table = np.column_stack([low + (high - low) * corners[:, :2], 0.0 * corners[:, 0]])
     return {
-        "points_by_time": frames,
-        "bodies": {min(frames): (table, cells), last: _many_rods.tubes(result.model, frames[last])},
+        "points_by_time": {t: frames[t] for t in list(frames)[::2] + [last]},
+        "bodies": {min(frames): (table, cells)},
+        "thick": True,
     }

@@ -103,6 +103,22 @@ def benchmark() -> ddg.bench.Study:
 
 
 def picture(result, frames) -> dict:
-    """Draw the beams at the end with actual thickness."""
+    """Draw the beams at the end with the contact force, and the force over the overlap."""
+    batch, motion = result.model.scene.batches[0], result.model.scene.supports[2].motion
+    start = result.model.scene.batches[1].points[0, 0, 2]
+    overlap = np.array([start - 2.0 * RADIUS + motion.shift(t)[0, 2] for t in result.times])
+    exact = 96.0 * float(np.max(batch.section.EI1)) / LENGTH**3 * np.maximum(-overlap, 0.0)
     last = max(frames)
-    return {"points_by_time": frames, "bodies": {last: _many_rods.tubes(result.model, frames[last])}}
+    return {
+        "points_by_time": {last: frames[last]},
+        "colors": np.array([[0.45, 0.6, 0.8], [0.82, 0.29, 0.36]]),
+        "contacts": result.model.contacts(result.state),
+        "chart": {
+            "lines": [
+                ("96 EI / L³ times the overlap", -1e3 * overlap, exact, "-"),
+                ("on the clamps", -1e3 * overlap, result.series["force"], "o"),
+            ],
+            "x": "overlap of the clamped beams [mm]",
+            "y": "force [N]",
+        },
+    }

@@ -18,6 +18,7 @@ EI = 1.0  # N m^2
 PERIOD = 1.0  # s
 OMEGA = 2.0 * np.pi / PERIOD
 RATIO = 2.0  # zeta_n / zeta_t
+DEFLECTIONS = 10.0  # magnification in the picture
 HYPERDIFFUSION = "Machin 1958, Wiggins and Goldstein 1998"
 
 
@@ -123,6 +124,24 @@ def check(result) -> list[ddg.Check]:
     """Check amplitude, phase and thrust against linear hyperdiffusion, after a period."""
     names = ("tip's amplitude over the base's", "tip's phase [rad]", "mean thrust over its closed form")
     return once_reached(result, PERIOD, names, lambda: last_period(result))
+
+
+def picture(result, frames) -> dict:
+    """Draw a period of the filament with magnified deflection, and the deflections of base and tip over time."""
+    motion = result.scene.supports[0].motion
+    base = [1e3 * motion.translation(t)[2] for t in result.times]
+    return {
+        "points_by_time": {t: points * [1.0, 1.0, DEFLECTIONS] for t, points in list(frames.items())[3:]},
+        "note": f"deflections times {DEFLECTIONS:g}",
+        "chart": {
+            "lines": [
+                ("base, driven", result.times, base, "-"),
+                ("tip", result.times, 1e3 * np.array(result.series["tip"]), "-"),
+            ],
+            "x": "time [s]",
+            "y": "deflection [mm]",
+        },
+    }
 
 
 def benchmark() -> ddg.bench.Study:

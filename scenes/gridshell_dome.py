@@ -8,6 +8,7 @@ under a force P at the crossing deflects by P L^3 / (96 EI), each beam carrying 
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp.scenes import _pictures
 from ddg_warp.solve.equilibrium.statics import solve
 
 SPAN = 10.0  # m
@@ -102,6 +103,18 @@ def check(result) -> list[ddg.Check]:
         ddg.Check("grillage with hinged joint, deflection 96 EI / P L^3", grillage(False), 1.0, 0.01, "beam theory"),
         ddg.Check("grillage with rigid joint, deflection 96 EI / P L^3", grillage(True), 1.0, 0.01, "beam theory"),
     ]
+
+
+def picture(result, frames) -> dict:
+    """Draw the dome without loads and with magnified sag, colored by the axial force."""
+    rest, points = result.model.state().points(), result.state.points()
+    factor = float(f"{0.08 * SPAN / np.abs(points - rest).max():.1g}")
+    return {
+        "points_by_time": {0.0: rest} | _pictures.magnified({1.0: points}, rest, factor),
+        "values": 1e-3 * _pictures.at_points(result.model, result.state, "axial_force"),
+        "label": "axial force, tension positive [kN]",
+        "note": f"displacements times {factor:g}; grey: without loads",
+    }
 
 
 def benchmark() -> ddg.bench.Study:

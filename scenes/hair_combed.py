@@ -141,7 +141,7 @@ def picture(result, frames) -> dict:
     times = times[0], times[len(times) // 2], times[-1]
     return {
         "points_by_time": {t: frames[t] for t in times},
-        "bodies": {t: _many_rods.colored_tubes(result.model, frames[t], t) for t in times},
-        "lines": False,
+        "colors": _many_rods.colors(result.model),
+        "thick": True,
         "side_by_side": True,
     }

@@ -9,6 +9,7 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.run.check import once_reached
+from ddg_warp.scenes import _pictures
 from ddg_warp.scenes.vibration import SAMPLES, step_factor
 
 LENGTH = 1.0  # m
@@ -114,6 +115,21 @@ def in_time(result, measured: np.ndarray, names) -> list[ddg.Check]:
         ddg.Check(names[0], frequency / nearest, 1.0, 1e-4, "eigenvalue"),
         ddg.Check(names[1], factor, 1.0, 1e-5, "implicit midpoint, linear mode"),
     ]
+
+
+def picture(result, frames) -> dict:
+    """Draw a period of the mode with magnified deflection, and the deflection of the free end over time."""
+    deflection, rest = 1e3 * np.array(result.series["tip_x"]), result.model.scene.batches[0].points[0]
+    factor = float(f"{250.0 * LENGTH / np.abs(deflection).max():.1g}")
+    return {
+        "points_by_time": _pictures.magnified(frames, rest, factor),
+        "note": f"displacements times {factor:g}",
+        "chart": {
+            "lines": [("", result.times, deflection, "-")],
+            "x": "time [s]",
+            "y": "deflection of the free end [mm]",
+        },
+    }
 
 
 def benchmark() -> ddg.bench.Study:

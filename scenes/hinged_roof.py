@@ -14,6 +14,7 @@ RADIUS, HALF_LENGTH, HALF_ANGLE = 2540.0, 254.0, 0.1  # mm, mm, rad
 YOUNG, POISSON = 3102.75, 0.3  # N/mm^2, 1
 LIMIT = {12.7: 2226.3, 6.35: 585.9}  # thickness [mm] -> first limit load [N]
 LENGTH_UNIT = "mm"
+HEIGHTS = 5.0  # magnification of heights in the picture
 
 
 def build(
@@ -76,6 +77,27 @@ def check(result) -> list[ddg.Check]:
             ddg.Check.skip("limit load [N]", f"there are tables for thicknesses of {' and '.join(map(str, LIMIT))} mm")
         ]
     return [ddg.Check("limit load [N]", limit(result.series)[0], LIMIT[thickness], 0.015, _sze.SOURCE, relative=True)]
+
+
+def picture(result, frames) -> dict:
+    """Draw the quarter at the start, at the limit load and at the end, with magnified heights, and the force over the drop."""
+    drop, force = (np.array(result.series[name]) for name in ("drop", "force"))
+    _, at_peak = limit(result.series)
+    times = sorted(frames)
+    times = times[0], min(times, key=lambda t: abs(t * drop[-1] - at_peak)), times[-1]
+    upright = {t: frames[t][:, [1, 2, 0]] * [1.0, 1.0, HEIGHTS] - [0.0, 0.0, HEIGHTS * RADIUS] for t in times}
+    return {
+        "points_by_time": upright,
+        "note": f"a quarter, crown to the left and in front; heights times {HEIGHTS:g}",
+        "chart": {
+            "lines": [
+                ("whole roof", drop, force, "-"),
+                ("limit load of Sze, Liu and Lo", [at_peak], [LIMIT[float(result.scene.shells[0].thickness)]], "o"),
+            ],
+            "x": "drop of the crown [mm]",
+            "y": "force [N]",
+        },
+    }
 
 
 def benchmark() -> ddg.bench.Study:

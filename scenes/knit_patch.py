@@ -143,7 +143,7 @@ def picture(result, frames) -> dict:
     times = min(frames), max(frames)
     return {
         "points_by_time": {t: frames[t] for t in times},
-        "bodies": {t: _many_rods.colored_tubes(result.model, frames[t]) for t in times},
-        "lines": False,
+        "colors": _many_rods.colors(result.model),
+        "thick": True,
         "side_by_side": True,
     }

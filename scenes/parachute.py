@@ -114,6 +114,16 @@ def _last_edges(model) -> list[float]:
     return [float(np.linalg.norm(batch.points[0, -1] - batch.points[0, -2])) for batch in model.scene.batches]
 
 
+def picture(result, frames) -> dict:
+    """Draw the parachute at a few times, and its speed over time."""
+    times = list(frames)[::2]
+    lines = [(name, result.times, result.series[name], "-") for name in ("payload", "canopy")]
+    return {
+        "points_by_time": {t: frames[t] for t in (*times, max(frames))},
+        "chart": {"lines": lines, "x": "time [s]", "y": "speed of descent [m/s]"},
+    }
+
+
 def benchmark() -> ddg.bench.Study:
     """Study the speed of payload and canopy at 2 s over steps, rings and tolerances, against a finer run."""
     return ddg.bench.Study(

@@ -174,5 +174,6 @@ def picture(result, frames) -> dict:
     floor = x * down + y * across
     return {
         "points_by_time": frames,
-        "bodies": {min(frames): (floor, cells)} | {last: _many_rods.tubes(result.model, points)},
+        "bodies": {min(frames): (floor, cells)},
+        "thick": True,
     }

@@ -9,6 +9,7 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
+from ddg_warp.scenes import _pictures
 
 RADIUS = 1.0  # m
 YOUNG = 1.0e9  # Pa
@@ -63,6 +64,27 @@ def check(result) -> list[ddg.Check]:
     """Check the stiffness against Reissner's."""
     measured = stiffness(result.model, result.state)
     return [ddg.Check("stiffness over exact", measured, 1.0, 0.03, SOURCE, relative=True)]
+
+
+def picture(result, frames) -> dict:
+    """Draw the magnified dent, colored by the deflection, and its profile."""
+    rest, points = result.model.state().points(), result.state.points()
+    deflection = ((points - rest) * rest).sum(1) / RADIUS
+    factor = float(f"{0.05 * RADIUS / np.abs(deflection).max():.1g}")
+    length = np.sqrt(RADIUS * float(result.scene.shells[0].thickness))
+    out = np.hypot(rest[:, 0], rest[:, 1]) / length
+    order = np.argsort(out)
+    return {
+        "points_by_time": _pictures.magnified({1.0: points}, rest, factor),
+        "values": 1e6 * deflection,
+        "label": "deflection [µm]",
+        "note": f"displacements times {factor:,.0f}",
+        "chart": {
+            "lines": [("", out[order], 1e6 * deflection[order], "-")],
+            "x": "distance from the pole over √(R h)",
+            "y": "deflection [µm]",
+        },
+    }
 
 
 def benchmark() -> ddg.bench.Study:

@@ -12,6 +12,7 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.run.check import once_reached
+from ddg_warp.scenes import _pictures
 
 LENGTH = 1.0  # m
 RADIUS = 0.05  # m; thick, so that torsion is among the lowest modes
@@ -199,6 +200,22 @@ def check(result) -> list[ddg.Check]:
         checks.append(ddg.Check(f"amplitude factor of a step at w h = 0.5, {scheme}", factor, exact[0], 1e-6, ONE_STEP))
         checks.append(ddg.Check(f"phase of a step at w h = 0.5, {scheme}", phase, exact[1], 1e-6, ONE_STEP))
     return checks
+
+
+def picture(result, frames) -> dict:
+    """Draw half a period of the mode with magnified deflection, and the deflection over time."""
+    deflection = np.array(result.series["deflection"])
+    rest, size = result.model.state().points(), np.abs(deflection).max()
+    factor = float(f"{0.15 * LENGTH / size:.1g}")
+    return {
+        "points_by_time": _pictures.magnified(frames, rest, factor),
+        "note": f"displacements times {factor:,.0f}",
+        "chart": {
+            "lines": [("", 1e3 * np.array(result.times), 1e3 * deflection, "-")],
+            "x": "time [ms]",
+            "y": "deflection [mm]",
+        },
+    }
 
 
 def benchmark() -> ddg.bench.Study:

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
+from ddg_warp.geometry import meshes
 from ddg_warp.io.rod_tubes import SIDES
 from ddg_warp.run import figure
 from ddg_warp.run.cli import main
+from ddg_warp.run.panel import tubes
 from ddg_warp.run.scene_registry import load_scene, one_liner, scene_files
 from ddg_warp.run.simulate import simulate
-from ddg_warp.scenes import _many_rods
 
 
 @pytest.fixture
@@ -18,6 +19,12 @@ def drawn(monkeypatch) -> list:
     figures = []
     monkeypatch.setattr(figure, "_save", lambda figure, path: figures.append(figure))
     return figures
+
+
+@pytest.fixture
+def plain(monkeypatch) -> None:
+    """Draw as without pyvista."""
+    monkeypatch.setattr(figure, "available", lambda: False)
 
 
 def labels(figure) -> list[str]:
@@ -69,7 +76,7 @@ def test_the_plate_shows_its_deflection():
     assert np.abs(shown[:, 2]).max() == pytest.approx(0.15)
 
 
-def test_paths_and_statics_have_a_load_and_their_units(drawn, tmp_path):
+def test_paths_and_statics_have_a_load_and_their_units(drawn, plain, tmp_path):
     """The frame is in millimetres, the legend separates branches, and no axis is a time."""
     assert main(["run", "right_angle_frame", "--n", "4", "--device", "cpu", "--out", str(tmp_path)]) == 0
     picture, path = drawn
@@ -95,7 +102,7 @@ def test_axes_are_equal_and_without_offsets(drawn):
     assert plot.xaxis.get_offset_text().get_text() == plot.yaxis.get_offset_text().get_text() == ""
 
 
-def test_shapes_of_a_path_keep_their_order(drawn):
+def test_shapes_of_a_path_keep_their_order(drawn, plain):
     """The last point of a path is on top even if the load is not the largest, and equal loads are all drawn."""
     points = np.eye(3)
     scene = ddg.Scene()
@@ -121,29 +128,28 @@ def test_hair_is_shown_with_its_head_side_by_side(drawn):
     assert len(drawn[0].axes) == 3
 
 
-def test_rods_are_drawn_as_tubes(drawn):
-    """Tubes of open and closed rods have correct surface areas and colors, with obstacles in grey, instead of lines."""
+def test_rods_have_their_thickness(drawn, plain):
+    """Tubes of open and closed rods have correct surface areas and colors, and obstacles are drawn too."""
     angle = 2.0 * np.pi * np.arange(60) / 60
     scene = ddg.Scene()
     section = {"section": ddg.Circle(0.05), "material": ddg.Material(1e6)}
     scene.add_rod(np.linspace((-1.0, 0.0, 0.0), (1.0, 0.0, 0.0), 5), **section)
     scene.add_rod(np.stack([np.cos(angle), np.sin(angle), 0.0 * angle + 1.0], axis=1), closed=True, **section)
-    scene.add_obstacle(ddg.Capsule((0, 0, 3), (1, 0, 3), 0.1), motion=ddg.Motion(translation=lambda t: (0.0, 0.0, t)))
-    scene.contact()
     model = scene.build("cpu")
-    points, triangles, colors = _many_rods.colored_tubes(model, model.state().points(), t=2.0)
+    points, triangles = tubes(model.state().points(), model.curves)
     a, b, c = np.moveaxis(points[triangles], 1, 0)
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    masks = [(colors == color).all(axis=1) for color in [*_many_rods.colors(model), [_many_rods.GREY] * 3]]
-    assert np.sum(masks) == len(triangles)
+    mine = triangles[:, 0] < 5 * SIDES
     perimeter = 2.0 * SIDES * 0.05 * np.sin(np.pi / SIDES)
     ring = 120.0 * np.sin(np.pi / 60)
-    assert [area[mine].sum() for mine in masks[:2]] == pytest.approx([2.0 * perimeter, ring * perimeter], rel=1e-3)
-    assert points[triangles[masks[2]], 2].min() == pytest.approx(4.9, abs=1e-3)
-    bodies = {0.0: (points, triangles, colors)}
-    figure.rods_picture(model, {0.0: model.state().points()}, "unused.png", bodies=bodies, lines=False)
-    (faces,) = drawn[0].axes[0].collections
-    assert len(faces.get_facecolor()) == len(triangles)
+    assert [area[mine].sum(), area[~mine].sum()] == pytest.approx([2.0 * perimeter, ring * perimeter], rel=1e-3)
+    ball = {0.0: meshes.sphere(1)}
+    colors = np.eye(3)[:2]
+    shapes = {0.0: model.state().points()}
+    figure.rods_picture(model, shapes, "unused.png", obstacles=ball, thick=True, colors=colors)
+    obstacle, rods = drawn[0].axes[0].collections
+    assert len(obstacle.get_facecolor()) == len(ball[0.0][1]) and len(rods.get_facecolor()) == len(triangles)
+    assert (rods.get_facecolor()[:, :2] > 0.0).sum(0).tolist() == [mine.sum(), (~mine).sum()]  # sorted by depth
 
 
 def test_learned_lines_and_named_shapes_are_labelled(drawn):
@@ -164,7 +170,7 @@ def test_learned_lines_and_named_shapes_are_labelled(drawn):
     assert [text.get_text() for text in drawn[2].axes[1].get_yticklabels()] == names
 
 
-def test_slim_shapes_fit_their_panels(drawn):
+def test_slim_shapes_fit_their_panels(drawn, plain):
     """Hanging strands are drawn whole, in their proportions."""
     module = load_scene("hair")
     result = simulate(module.build(strands=4), device="cpu", duration=1.0 / 60.0, progress=False)
@@ -183,7 +189,7 @@ def test_slim_shapes_fit_their_panels(drawn):
     assert (pixels > plot.bbox.min).all() and (pixels < plot.bbox.max).all()
 
 
-def test_titles_fit(drawn):
+def test_titles_fit(drawn, plain):
     """Titles of all scenes fit, in both kinds of pictures."""
     points = np.eye(3)
     scene = ddg.Scene()

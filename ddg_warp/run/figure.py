@@ -4,35 +4,41 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgba_array
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
-from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-from ddg_warp.io.colors import SCALE
+from ddg_warp.io.colors import CONTACT, SCALE
+from ddg_warp.io.contact_records import Contacts
 from ddg_warp.io.shapes import Shapes
+from ddg_warp.run.panel import DPI, GREY, LOAD, MARGIN, Panel, RenderedPanel
+from ddg_warp.run.render import View, available
+from ddg_warp.view.drawing import Drawing, directions, largest_force
+from ddg_warp.view.drawing import arrows as contact_arrows
 
-DPI = 160
 FLAT = 1e-3  # largest thickness over size of flat shapes
 ELEVATION, AZIMUTH = 18.0, -58.0  # of the eye [degrees]
-WIDEST = 0.72  # largest visible width over diagonal of a box in a panel
-MARGIN = 0.06  # of the size, around the rods
-FIELD_COLOR = "#c9bfd6"
+WIDTH, TALLEST = 7.0, 6.0  # of a picture and of its shapes [inches]
+PLOT, BAR, HEADER = 2.5, 0.6, 0.75  # heights of a chart, of a color bar below shapes, and the title [inches]
+SHARE, STACKED = (
+    0.58,
+    1.9,
+)  # width of shapes left of a chart over the width of the picture, and aspect above which the chart is below
+NARROWEST_AND_WIDEST = (0.5, 3.5)  # width over height of shapes
+RULER = 0.08  # height of the strip for scale bar and triad over the size of the shapes
+ARROW = 0.15  # length of the longest arrow over the size
+TICKS = 0.05  # least distance of ticks over the range
 ARROWS = {2: 9, 3: 4}  # of a field along the longest side of a picture, by its dimension
-GREY = "0.35"
 LIGHT_GREY = (0.78, 0.78, 0.78, 1.0)
-CLOSE = 1.45  # zoom of a solid scene without axes
 TITLE = 11  # letters of a title in an inch
 STABILITY = {"stable": (False, "-"), "unstable": (True, "--")}
 SPECIAL = {"limit point": "o", "bifurcation": "D"}
-LIGHT = np.array([-0.37, -0.56, 0.74])  # unit vector from the surfaces to the light
-DARKEST = 0.55  # brightness at grazing light
 TIME_COLORS = LinearSegmentedColormap.from_list("time", SCALE)
 MARKERS = "osD^vP"
 
@@ -49,11 +55,20 @@ def rods_picture(
     values: np.ndarray | None = None,
     colors: np.ndarray | None = None,
     bodies: Mapping[float, tuple[np.ndarray, ...]] | None = None,
-    lines: bool = True,
+    obstacles: Mapping[float, tuple[np.ndarray, np.ndarray]] | None = None,
+    thick: bool = False,
     side_by_side: bool = False,
     field: Callable[[np.ndarray], np.ndarray] | None = None,
+    fixed: np.ndarray | None = None,
+    loads: tuple[np.ndarray, np.ndarray] | None = None,
+    contacts: Contacts | None = None,
+    angles: tuple[float, float] = (ELEVATION, AZIMUTH),
+    note: str = "",
+    chart=None,
 ) -> None:
     """Draw rods and surfaces at a few times, the last on top; flat if all lie in a coordinate plane.
+
+    Solid scenes are shaded with true depth if pyvista is installed, else drawn with matplotlib.
 
     Args:
         rods: A model, a `TrajectoryReader`, the curves of either, or a `CurveSet`.
@@ -67,9 +82,16 @@ def rods_picture(
         values: A number at each point, shape (P,) of all worlds, to color the latest shape; `label` is then its name.
         colors: RGB of each rod, shape (R, 3), instead of a color a time.
         bodies: Other surfaces at each time: points (n, 3) and triangles (t, 3), grey, or with RGB of each (t, 3).
-        lines: Whether rods are drawn as lines; False where bodies show them with their thickness.
+        obstacles: Closed surfaces and planes at each time, points and triangles; pyvista leaves out their inside.
+        thick: Whether rods of flat scenes and of matplotlib have their thickness, too; pyvista shows it anyway.
         side_by_side: Whether every shape has a panel.
         field: Vectors (n, 3) at points (n, 3), drawn as arrows behind the latest shape; the largest is as long as the grid spacing.
+        fixed: Rows of points of the latest shape to mark as fixed.
+        loads: Rows of points (n,) and forces there (n, 3), drawn at the latest shape.
+        contacts: Pairs in contact, whose forces are drawn.
+        angles: Elevation and azimuth of the eye [degrees].
+        note: A small line below.
+        chart: Arguments of `lines_plot`, such as force against displacement, or a followed path, drawn on the right or below.
     """
     curves = getattr(rods, "curves", rods)
     frames = sorted(points_by_time.items()) if isinstance(points_by_time, Mapping) else list(points_by_time)
@@ -80,48 +102,99 @@ def rods_picture(
     surfaces = getattr(rods, "surfaces", None)
     worlds = points.shape[1] // Shapes.of(curves, surfaces).point_count
     shapes = Shapes.of(curves, surfaces, worlds)
-    extents = np.concatenate([points.reshape(-1, 3), *(body for body, *_ in (bodies or {}).values())])
+    shown = [(time, body, body is obstacles) for body in (bodies, obstacles) for time in (body or {}) if time in times]
+    shown = [(time, *each[time], closed) for time, each, closed in shown]
+    extents = np.concatenate([points.reshape(-1, 3), *(body for _, body, *_ in shown)])
     low, high = extents.min(axis=0), extents.max(axis=0)
-    flat = np.flatnonzero(high - low <= FLAT * np.max(high - low))
+    size = float(np.max(high - low))
+    flat = np.flatnonzero(high - low <= FLAT * size)
     axes = [k for k in range(3) if k != (flat[0] if len(flat) else None)]
+    arrows = {}
+    if loads is not None and len(loads[0]):
+        pushed = np.isin(loads[0], shapes.rows, invert=True)[:, None]  # arrows onto surfaces end there
+        vectors = ARROW * size / np.linalg.norm(loads[1], axis=1).max() * loads[1]
+        arrows[LOAD] = np.stack([-vectors * pushed, vectors * ~pushed], 1) + points[-1][loads[0], None]
+    if contacts is not None and (largest := largest_force(contacts)):
+        arrows[CONTACT] = contact_arrows(contacts, ARROW * size / largest)
     norm = Normalize(times.min(), times.max() if np.ptp(times) > 0.0 else times[0] + 1.0)
     if values is not None:
         norm = Normalize(np.nanmin(values), np.nanmax(values))
-    panels = len(times) if side_by_side else 1
-    figure = Figure(figsize=(7.0 if panels == 1 else 3.2 * panels, 5.2 if panels == 1 else 3.6), layout="constrained")
-    plots = [
-        (_flat_axes if len(flat) else _solid_axes)(figure, axes, low, high, unit, (1, panels, k + 1))
-        for k in range(panels)
-    ]
+    rendered = len(axes) == 3 and available()
+    view = None
+    if rendered:
+        tips = [ends.reshape(-1, 3) for ends in arrows.values()]
+        directions_of_view = directions(*np.radians(angles))
+        view = View.fitted(np.concatenate([extents, *tips]), directions_of_view, NARROWEST_AND_WIDEST)
+        view = replace(view, low=view.low - [0.0, RULER * view.size.max()])
+    count = len(times) if side_by_side else 1
+    figure, cells, chart_cell, across = _layout(count, view, axes, low, high, chart)
+    if rendered:
+        drawing = Drawing(curves, surfaces, worlds, points[0])
+        width = round(DPI * across)
+        panels = [RenderedPanel(figure, cell, view, drawing, unit, (width, across)) for cell in cells]
+    else:
+        panels = [Panel(figure, cell, axes, low, high, unit, angles) for cell in cells]
     for number, (time, shape) in enumerate(zip(times, points, strict=True)):
-        plot, latest = plots[number % panels], side_by_side or number == len(times) - 1
+        panel, latest = panels[number % count], side_by_side or number == len(times) - 1
         if field is not None and latest:
-            _draw_field(plot, axes, low, high, field)
+            panel.field(_field_arrows(axes, low, high, field))
         color = TIME_COLORS(norm(time)) if len(times) > 1 else TIME_COLORS(0.5)
         if values is not None:
             color = TIME_COLORS(norm(values)) if latest else LIGHT_GREY
-        if time in (bodies or {}):
-            body, triangles, *shades = bodies[time]
-            shade = to_rgba_array(shades[0]) if shades else LIGHT_GREY
-            _draw_triangles(plot, body[triangles][..., axes], shade)
+        for _, body, triangles, *shades, closed in (each for each in shown if each[0] == time):
+            panel.triangles(body, triangles, shades[0] if shades else LIGHT_GREY, closed=closed)
         if surfaces is not None:
-            faces = shapes.surfaces.triangles
-            shade = color[faces].mean(axis=1) if np.ndim(color) == 2 else color
-            _draw_triangles(plot, shape[faces][..., axes], shade)
-        if lines and len(curves.counts):
+            panel.surfaces(shape, shapes, color, latest)
+        if len(curves.counts):
             shade = color[shapes.rows] if np.ndim(color) == 2 else color
-            _draw_rods(plot, shape[shapes.rows][:, axes], shapes.curves, shade if colors is None else colors, latest)
+            panel.rods(shape, shapes, shade if colors is None else colors, latest, thick)
+        if latest and fixed is not None and len(fixed):
+            panel.marks(shape[fixed])
         if side_by_side:
-            plot.set_axis_off()
-            if not len(flat):
-                sides = np.ptp([plot.get_xlim(), plot.get_ylim(), plot.get_zlim()], axis=1)
-                plot.set_box_aspect(sides, zoom=CLOSE * min(_to_fit(sides), WIDEST / _seen(sides)[0]))
+            panel.bare()
             text = f"{label.partition(' [')[0]} {time:.3g} {label.partition('[')[2].rstrip(']')}"
-            plot.set_title(text if names is None else names[number], fontsize=9, color=GREY)
-    if not side_by_side:
-        _explain_times(figure, plots[0], times, norm, label, values, names)
+            panel.plot.set_title(text if names is None else textwrap.fill(names[number], 26), fontsize=9, color=GREY)
+    for color, ends in arrows.items():
+        panels[-1].arrows(ends, color)
+    for number, panel in enumerate(panels):
+        panel.finish(ruler=number == 0)
+    if not side_by_side or values is not None:
+        _explain_times(figure, panels, times, norm, label, values, names, across < WIDTH / count)
+    if isinstance(chart, Mapping):
+        _draw_lines(figure.add_subplot(chart_cell), **{"title": "", "log": False, **chart})
+    elif chart is not None:
+        _draw_path(figure.add_subplot(chart_cell), chart, unit)
+    notes = [note] if note else []
+    if fixed is not None and len(fixed):
+        notes.append("dark dots: fixed nodes")
+    if LOAD in arrows:
+        notes.append("green arrows: applied forces")
+    if CONTACT in arrows:
+        notes.append(f"red arrows: contact forces of pairs, largest {largest:.3g} N")
+    if notes:
+        figure.supxlabel("; ".join(notes), fontsize=8, color=GREY, x=0.03, ha="left")
     figure.suptitle(textwrap.fill(title, round(TITLE * figure.get_figwidth())), x=0.03, ha="left", fontsize=11)
     _save(figure, path)
+
+
+def _layout(count: int, view: View | None, axes: list[int], low, high, chart):
+    """Return a figure, grid cells of its panels and of the chart right of or below them, and a panel's width [inches]."""
+    aspect = view.aspect if view else 1.3
+    if len(axes) == 2:
+        sides = (high - low)[axes] + 2.0 * MARGIN * np.max(high - low)
+        aspect = float(np.clip(sides[0] / sides[1], *NARROWEST_AND_WIDEST))
+    wide = chart is not None and aspect > STACKED
+    across = WIDTH * (1.0 if chart is None or wide else SHARE) / count
+    height = float(np.clip(across / aspect, 1.3, TALLEST)) + (0.5 if view is None else 0.0)
+    total = (max(height + BAR, PLOT) if chart is not None and not wide else height + PLOT * wide) + HEADER
+    figure = Figure(figsize=(WIDTH, total), layout="constrained")
+    if chart is None:
+        return figure, list(figure.add_gridspec(1, count)), None, across
+    if wide:
+        outer = figure.add_gridspec(2, 1, height_ratios=[height, PLOT])
+    else:
+        outer = figure.add_gridspec(1, 2, width_ratios=[SHARE, 1.0 - SHARE])
+    return figure, list(outer[0].subgridspec(1, count)), outer[1], across
 
 
 def error_plot(
@@ -197,7 +270,13 @@ def lines_plot(path, lines: Iterable[tuple], x: str, y: str, title: str = "", lo
         log: Whether the vertical axis is logarithmic.
     """
     figure = Figure(figsize=(7.0, 4.6), layout="constrained")
-    plot, lines = figure.add_subplot(), list(lines)
+    _draw_lines(figure.add_subplot(), lines, x, y, title, log)
+    _save(figure, path)
+
+
+def _draw_lines(plot, lines: Iterable[tuple], x: str, y: str, title: str, log: bool) -> None:
+    """Draw lines into axes; see `lines_plot`."""
+    lines = list(lines)
     labels = list(dict.fromkeys(label for label, *_ in lines))
     shown = set()
     for label, along, values, style in lines:
@@ -209,8 +288,8 @@ def lines_plot(path, lines: Iterable[tuple], x: str, y: str, title: str = "", lo
     plot.set_title(textwrap.fill(title, 80), loc="left", fontsize=11)
     plot.grid(color="0.92", linewidth=0.6)
     plot.spines[["top", "right"]].set_visible(False)
-    plot.legend(frameon=False, fontsize=9)
-    _save(figure, path)
+    if labels != [""]:
+        plot.legend(frameon=False, fontsize=9)
 
 
 def path_plot(path, file, title: str = "", unit: str = "m") -> None:
@@ -224,6 +303,13 @@ def path_plot(path, file, title: str = "", unit: str = "m") -> None:
     """
     figure = Figure(figsize=(6.0, 4.4), layout="constrained")
     plot = figure.add_subplot()
+    _draw_path(plot, path, unit)
+    plot.set_title(textwrap.fill(title, round(TITLE * figure.get_figwidth())), loc="left", fontsize=11)
+    _save(figure, file)
+
+
+def _draw_path(plot, path, unit: str) -> None:
+    """Draw a path into axes; see `path_plot`."""
     names, load = list(path.points[0].values), path.load
     unstable = _unstable(path)
     kinds = {kind: marker for kind, marker in SPECIAL.items() if path.of_kind(kind)}
@@ -244,13 +330,12 @@ def path_plot(path, file, title: str = "", unit: str = "m") -> None:
     for kind, marker in kinds.items():
         plot.plot([], [], marker, color=GREY, markersize=5, label=kind)
     plot.autoscale()
-    plot.ticklabel_format(useOffset=False)
+    plot.ticklabel_format(useOffset=False, scilimits=(-2, 5))
+    plot.locator_params(axis="x", nbins=5)
     plot.set(xlabel=f"displacement [{unit}]", ylabel="load parameter")
-    plot.set_title(textwrap.fill(title, round(TITLE * figure.get_figwidth())), loc="left", fontsize=11)
     plot.grid(color="0.9", linewidth=0.6)
     plot.spines[["top", "right"]].set_visible(False)
     plot.legend(frameon=False, fontsize=9)
-    _save(figure, file)
 
 
 def _unstable(path) -> np.ndarray:
@@ -261,23 +346,8 @@ def _unstable(path) -> np.ndarray:
     return np.where(regular[:-1] | regular[1:], either, negative[:-1] & negative[1:])
 
 
-def _draw_rods(plot, points: np.ndarray, curves, color, latest: bool) -> None:
-    """Add polylines in two or three dimensions."""
-    kind = LineCollection if points.shape[-1] == 2 else Line3DCollection
-    polylines = _polylines(points, curves.counts, curves.closed)
-    if len(color) == len(points) and np.ndim(color) == 2:  # a color at every point: draw edge by edge
-        shades = _polylines(np.asarray(color), curves.counts, curves.closed)
-        color = np.concatenate([0.5 * (shade[1:] + shade[:-1]) for shade in shades])
-        polylines = [edge for line in polylines for edge in np.stack([line[:-1], line[1:]], axis=1)]
-    lines = kind(
-        polylines, colors=color if np.ndim(color) == 2 else [color], linewidths=_line_width(len(curves.counts), latest)
-    )
-    lines.set(capstyle="round", joinstyle="round")
-    plot.add_collection(lines)
-
-
-def _draw_field(plot, axes: list[int], low: np.ndarray, high: np.ndarray, field) -> None:
-    """Add arrows on a grid that fills the box."""
+def _field_arrows(axes: list[int], low: np.ndarray, high: np.ndarray, field) -> np.ndarray:
+    """Return arrows (n, 2, 3) of a field on a grid that fills the box."""
     size = np.max(high - low)
     step = (1.0 + 2.0 * MARGIN) * size / ARROWS[len(axes)]
     middle = 0.5 * (low + high)
@@ -289,99 +359,37 @@ def _draw_field(plot, axes: list[int], low: np.ndarray, high: np.ndarray, field)
     vectors = np.asarray(field(points), float)
     longest = np.linalg.norm(vectors[:, axes], axis=1).max()
     if longest == 0.0:
-        return
+        return np.zeros((0, 2, 3))
     vectors = 0.8 * step / longest * vectors
-    starts = (points - 0.5 * vectors)[:, axes]
-    style = {"color": FIELD_COLOR, "zorder": 0}
-    if len(axes) == 2:
-        plot.quiver(*starts.T, *vectors[:, axes].T, angles="xy", scale_units="xy", scale=1.0, width=0.004, **style)
-    else:
-        plot.quiver(*starts.T, *vectors.T, linewidth=0.8, arrow_length_ratio=0.25, **style)
+    return np.stack([points - 0.5 * vectors, points + 0.5 * vectors], 1)
 
 
-def _draw_triangles(plot, corners: np.ndarray, color) -> None:
-    """Add triangles, corners (T, 3, 2), or shaded ones, corners (T, 3, 3); thin edges close gaps."""
-    if corners.shape[-1] == 2:
-        each = color if np.ndim(color) == 2 else [color]
-        plot.add_collection(PolyCollection(corners, facecolors=each, edgecolors=each, linewidths=0.2))
-        return
-    vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    facing = np.abs(vectors @ LIGHT) / np.maximum(np.linalg.norm(vectors, axis=1), np.finfo(float).tiny)
-    shaded = np.array(np.broadcast_to(color, (len(corners), 4)))
-    shaded[:, :3] *= (DARKEST + (1.0 - DARKEST) * facing)[:, None]  # both sides alike
-    plot.add_collection(Poly3DCollection(corners, facecolors=shaded, edgecolors=shaded, linewidths=0.2))
-
-
-def _polylines(points: np.ndarray, counts: np.ndarray, closed: np.ndarray) -> list[np.ndarray]:
-    """Return the polyline of each rod; a closed one ends at its first point."""
-    lines = np.split(points, np.cumsum(counts)[:-1])
-    return [np.vstack([line, line[:1]]) if shut else line for line, shut in zip(lines, closed, strict=True)]
-
-
-def _line_width(rod_count: int, latest: bool) -> float:
-    """Return the line width in points: thin for many rods and for earlier shapes."""
-    few = np.interp(np.log10(rod_count), [0.0, 1.0, 3.0], [2.2, 1.4, 0.45])
-    return few if latest else 0.7 * few
-
-
-def _flat_axes(figure: Figure, axes: list[int], low: np.ndarray, high: np.ndarray, unit: str, place):
-    plot = figure.add_subplot(*place, aspect="equal")
-    margin = MARGIN * np.max(high - low)
-    limits = [(low[k] - margin, high[k] + margin) for k in axes]
-    names = [f"{'xyz'[k]} [{unit}]" for k in axes]
-    plot.set(xlim=limits[0], ylim=limits[1], xlabel=names[0], ylabel=names[1])
-    plot.ticklabel_format(useOffset=False)
-    plot.grid(color="0.92", linewidth=0.6)
-    plot.set_axisbelow(True)
-    plot.spines[["top", "right"]].set_visible(False)
-    return plot
-
-
-def _solid_axes(figure: Figure, axes: list[int], low: np.ndarray, high: np.ndarray, unit: str, place):
-    plot = figure.add_subplot(*place, projection="3d", computed_zorder=False)
-    plot.set_proj_type("ortho")
-    plot.view_init(elev=ELEVATION, azim=AZIMUTH)
-    margin = MARGIN * np.max(high - low)
-    limits = np.stack([low - margin, high + margin], axis=1)
-    plot.set(xlim=limits[0], ylim=limits[1], zlim=limits[2])
-    sides = limits[:, 1] - limits[:, 0]
-    plot.set_box_aspect(sides, zoom=_to_fit(sides))
-    lengths = sides / sides.max()
-    for axis, name, relative in zip((plot.xaxis, plot.yaxis, plot.zaxis), "xyz", lengths, strict=True):
-        axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
-        axis.set_label_text(f"{name} [{unit}]", fontsize=9)
-        axis.get_major_formatter().set_useOffset(False)
-        axis.set_major_locator(MaxNLocator(nbins=max(2, round(4.0 * relative))))  # labels of short axes do not overlap
-        axis._axinfo["grid"].update(color="0.9", linewidth=0.5)
-    plot.tick_params(labelsize=8, colors=GREY)
-    return plot
-
-
-def _to_fit(sides: np.ndarray) -> float:
-    """Return the zoom that fits a box into the height of matplotlib's cube, at most 1."""
-    return min(1.0, _seen(np.ones(3))[1] / _seen(sides)[1])
-
-
-def _seen(sides: np.ndarray) -> np.ndarray:
-    """Return visible width and height of a box over the diagonal, the length that matplotlib normalises."""
-    elevation, azimuth = np.radians([ELEVATION, AZIMUTH])
-    wide = [np.sin(azimuth), np.cos(azimuth), 0.0]
-    high = [np.cos(azimuth) * np.sin(elevation), np.sin(azimuth) * np.sin(elevation), np.cos(elevation)]
-    return np.abs([wide, high]) @ sides / np.linalg.norm(sides)
-
-
-def _explain_times(figure: Figure, plot, times: np.ndarray, norm: Normalize, label: str, values, names) -> None:
-    """Add a color bar with a tick at each drawn time, or of the values of the latest shape."""
+def _explain_times(
+    figure: Figure, panels: list, times, norm: Normalize, label: str, values, names, below: bool
+) -> None:
+    """Add a color bar, `below` the panels or at their right: a tick at each drawn time that has room, or of `values`."""
     if len(times) == 1 and values is None:
         return
-    gap = 0.10 if plot.name == "3d" else 0.03  # room for the label of the z axis
-    bar = figure.colorbar(ScalarMappable(norm, TIME_COLORS), ax=plot, shrink=0.6, aspect=28, pad=gap)
+    gap = 0.10 if panels[0].plot.name == "3d" else 0.03  # room for the label of the z axis
+    plots, side = [panel.plot for panel in panels], "bottom" if below else "right"
+    bar = figure.colorbar(ScalarMappable(norm, TIME_COLORS), ax=plots, location=side, shrink=0.7, aspect=24, pad=gap)
     if names is None or values is not None:
         bar.set_label(label, fontsize=9)
     if values is None:
-        bar.set_ticks(times, labels=names or [f"{time:.3g}" for time in times])
+        ticks = apart(times) if names is None else times
+        bar.set_ticks(ticks, labels=names or [f"{time:.3g}" for time in ticks])
     bar.ax.tick_params(labelsize=8)
     bar.outline.set_visible(False)
+
+
+def apart(times: np.ndarray) -> np.ndarray:
+    """Return the first and last of numbers, and the ones between at least TICKS of the range from others."""
+    low, high = np.min(times), np.max(times)
+    kept = [low]
+    for time in np.unique(times):
+        if min(time - kept[-1], high - time) >= TICKS * (high - low):
+            kept.append(time)
+    return np.array(kept if high == low else [*kept, high])
 
 
 def _save(figure: Figure, path) -> None:

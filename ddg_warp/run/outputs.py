@@ -5,10 +5,13 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from ddg_warp.run.run_directory import PICTURES
 from ddg_warp.run.scene_registry import one_liner
 
 LOG = logging.getLogger("ddg_warp")
+MARKED = 60  # fixed points drawn at most
 
 
 def run_checks(check: Callable | None, result) -> list:
@@ -63,10 +66,16 @@ def draw(directory: Path, module, result, shapes: int = 6) -> None:
         if (applied := result.scene.applied_field) is not None:
             last = frames[-1][0]
             options["field"] = partial(applied.over, t=last, otherwise=last if result.dt is None else 1.0)
-        if reader.obstacles is not None:
-            options["bodies"] = standing(reader, {frame: float(abscissa[frame]) for frame in chosen})
+        options |= marks(result, frames[-1][0])
         if hasattr(module, "picture") and not result.failure:
             options |= module.picture(result, dict(frames))
+        if reader.obstacles is not None and not {"bodies", "obstacles"} & options.keys():
+            shown = dict(options["points_by_time"])
+            shown_at = {frame: float(abscissa[frame]) for frame in chosen if float(abscissa[frame]) in shown}
+            options["obstacles"] = standing(reader, shown_at, options.get("side_by_side", False))
+        options.setdefault("chart", result.path)
+        if options.get("side_by_side"):
+            options |= {"fixed": None, "loads": None}
         rods_picture(reader, path=directory / "picture.png", title=title, **options)
     if result.path is not None:
         path_plot(result.path, directory / "path.png", title, unit)
@@ -74,10 +83,40 @@ def draw(directory: Path, module, result, shapes: int = 6) -> None:
         lines_plot(directory / "learned.png", **module.plot(result))
 
 
-def standing(reader, times: dict[int, float]) -> dict[float, tuple]:
-    """Return obstacles of the first world as surfaces by time; fixed ones only at the first time."""
+def standing(reader, times: dict[int, float], each: bool = False) -> dict[float, tuple]:
+    """Return obstacles of the first world as surfaces by time; fixed ones at the first time, or at `each`."""
     obstacles, nodes, shown = reader.obstacles, reader.obstacle_points, {}
     for frame, time in times.items():
         moved = None if nodes is None else nodes[frame].reshape(-1, *nodes.shape[-2:])[0]
-        shown[time] = obstacles.surface(moved, obstacles.moved | (not shown))
+        shown[time] = obstacles.surface(moved, obstacles.moved | (each or not shown))
     return shown
+
+
+def marks(result, last: float) -> dict:
+    """Return fixed points of the first world as `fixed`, up to MARKED of them, and forces at points as `loads`.
+
+    Args:
+        result: The result.
+        last: Time [s] or load parameter of the forces.
+    """
+    from ddg_warp.solve.equilibrium.tangent import Tangent
+
+    model, scene = result.model, result.model.scene
+    tangent = Tangent(model)
+    free = tangent.at_points(tangent.free.astype(float)).reshape(model.worlds, -1, 3)[0]
+    fixed = np.flatnonzero(~free.any(1))
+    counts = model.curves.counts
+    starts = np.cumsum(counts) - counts
+    vertices = int(np.sum(counts)) + np.cumsum([0] + [len(shell.points) for shell in scene.shells])
+    rows, forces = [np.zeros(0, int)], [np.zeros((0, 3))]
+    for load in (*scene.loads, *scene.shell_loads):
+        amplitude = load.amplitude(last) if load.amplitude else last if result.dt is None else 1.0
+        if hasattr(load, "shell"):
+            rows.append(vertices[load.shell] + np.atleast_1d(load.vertices))
+        else:
+            rods = np.atleast_1d(load.rods)
+            rows.append(starts[rods] + load.node % counts[rods])
+        forces.append(np.broadcast_to(amplitude * np.asarray(load.force, float), (len(rows[-1]), 3)))
+    rows, forces = np.concatenate(rows), np.concatenate(forces)
+    acting = np.linalg.norm(forces, axis=1) > 0.0
+    return {"fixed": fixed if len(fixed) <= MARKED else None, "loads": (rows[acting], forces[acting])}

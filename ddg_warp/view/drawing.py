@@ -95,6 +95,7 @@ class Drawing:
         lines: `Lines` by thickness.
         skins: `Skin` of each surface.
         shapes: The full scene.
+        chosen: Drawn rods (r,), and k of every k-th node of each that is drawn.
         size: Diagonal of the box around rods and surfaces [m].
         note: Text of the drawn and the total numbers, and of the rules of decimation that apply.
     """
@@ -103,6 +104,7 @@ class Drawing:
         self.shapes, self.obstacles = Shapes.of(curves, surfaces, worlds), obstacles
         points = np.reshape(points, (-1, 3))
         self.size = float(np.linalg.norm(np.ptp(points, axis=0))) or 1.0
+        self.chosen = np.zeros(0, int), 1
         notes: list[str] = []
         self.lines = self._rods(notes)
         self.skins = self._surfaces(points, notes)
@@ -116,11 +118,10 @@ class Drawing:
         if not edges:
             return []
         stride = -(-edges // EDGES)
-        chosen = np.arange(rods)
         by_rods = stride > 1 and rods // stride >= RODS
-        if by_rods:
-            chosen = chosen[::stride]
-        ends, owner = self.edges(chosen, 1 if by_rods else stride)
+        chosen = np.arange(rods)[:: stride if by_rods else 1]
+        self.chosen = chosen, 1 if by_rods else stride
+        ends, owner = self.edges(*self.chosen)
         text = f"{len(chosen)} of {rods} rods" if by_rods else f"{rods} rod{'s' * (rods > 1)}"
         notes.append(f"{text} with {len(ends)} of {edges} edges" if stride > 1 else f"{text} with {edges} edges")
         if stride > 1:
@@ -136,13 +137,9 @@ class Drawing:
 
     def edges(self, rods: np.ndarray, stride: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """Return rows of both ends of the edges between every `stride`-th node of rods (n, 2), and their rods (n,)."""
-        curves = self.shapes.curves
-        counts, closed = np.asarray(curves.counts), np.asarray(curves.closed, bool)
-        starts = np.cumsum(counts) - counts
-        owner = np.repeat(np.arange(len(counts)), counts)
-        along = np.arange(len(owner)) - starts[owner]
-        last = ~closed[owner] & (along == counts[owner] - 1)
-        nodes = np.flatnonzero(np.isin(owner, rods) & ((along % stride == 0) | last))
+        nodes, owner = self._nodes(rods, stride)
+        closed = np.asarray(self.shapes.curves.closed, bool)
+        starts = np.cumsum(self.shapes.curves.counts) - self.shapes.curves.counts
         following = np.roll(nodes, -1)
         same = owner[nodes] == owner[following]
         same[-1] = False
@@ -151,6 +148,22 @@ class Drawing:
         back = at_end[closed[owner[at_end]]]
         first, second = np.concatenate([first, back]), np.concatenate([second, starts[owner[back]]])
         return self.shapes.rows[np.stack([first, second], 1)], owner[first]
+
+    def tubes(self) -> tuple[np.ndarray, Curves]:
+        """Return the drawn nodes (n,) of the drawn rods among all rod points, and these rods as curves."""
+        curves, (rods, stride) = self.shapes.curves, self.chosen
+        nodes, owner = self._nodes(rods, stride)
+        counts = np.bincount(owner[nodes], minlength=len(curves.counts))[rods]
+        named = {name: np.asarray(getattr(curves, name))[rods] for name in ("closed", "names", "batch")}
+        return nodes, Curves(counts=counts, radius=np.asarray(curves.radius)[nodes], **named)
+
+    def _nodes(self, rods: np.ndarray, stride: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return every `stride`-th node and the last of rods among all rod points, and the rod of every rod point."""
+        counts, closed = np.asarray(self.shapes.curves.counts), np.asarray(self.shapes.curves.closed, bool)
+        owner = np.repeat(np.arange(len(counts)), counts)
+        along = np.arange(len(owner)) - (np.cumsum(counts) - counts)[owner]
+        last = ~closed[owner] & (along == counts[owner] - 1)
+        return np.flatnonzero(np.isin(owner, rods) & ((along % stride == 0) | last)), owner
 
     def _surfaces(self, points: np.ndarray, notes: list[str]) -> list[Skin]:
         """Return the drawn triangles of each surface."""
@@ -189,13 +202,18 @@ class Drawing:
         low, high = points.min(0), points.max(0)
         center = 0.5 * (low + high)
         flat = high[1] - low[1] <= 1e-6 * self.size
-        elevation, azimuth = (0.0, -0.5 * np.pi) if flat else (ELEVATION, AZIMUTH)
-        right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-        toward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+        right, up, toward = directions(*((0.0, -0.5 * np.pi) if flat else (ELEVATION, AZIMUTH)))
         offset = points - center
-        aside = np.maximum(np.abs(offset @ right), np.abs(offset @ np.cross(toward, right)))
+        aside = np.maximum(np.abs(offset @ right), np.abs(offset @ up))
         distance = float(np.max(offset @ toward + MARGIN * aside / np.tan(0.5 * FIELD_OF_VIEW))) or self.size
         return {"position": center + distance * toward, "look_at": center}
+
+
+def directions(elevation: float, azimuth: float) -> np.ndarray:
+    """Return unit vectors (3, 3) to the right, upwards, and to the eye of a view, by the angles of the eye [rad]."""
+    right = [-np.sin(azimuth), np.cos(azimuth), 0.0]
+    toward = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    return np.array([right, np.cross(toward, right), toward])
 
 
 def _corner_counts(shapes: Shapes) -> np.ndarray:

@@ -13,12 +13,12 @@ from ddg_warp.model.controls import Controls
 from ddg_warp.model.masses import point_masses
 from ddg_warp.model.model import check_model
 from ddg_warp.model.state import check_state
-from ddg_warp.postprocess.fields import CELL_FIELDS, POINT_FIELDS, cell_fields, point_fields
 from ddg_warp.view.drawing import Drawing, Frame, largest_force, legend, value_range
 from ddg_warp.view.handles import Grips, Springs
 from ddg_warp.view.parameter_slider import ParameterSlider, adjustable
-from ddg_warp.view.recording import NO_FIELD, SPEED, first_world, label
+from ddg_warp.view.recording import NO_FIELD
 from ddg_warp.view.stage import PORT, Stage
+from ddg_warp.view.states import fields_of, frame_of
 
 FRAME_RATE = 30.0  # drawn states a second at most [1/s]
 KEPT = 400  # frames that `save` writes at most; with more every second one is dropped
@@ -77,11 +77,8 @@ class Viewer:
         gui.add_button("reset").on_click(lambda _: self._ask_reset())
         self._pace = gui.add_number("speed [s/s], 0: unbounded", initial_value=pace, min=0.0, step=0.01)
         self._time = gui.add_text("time [s]", "", disabled=True)
-        names = {SPEED: SPEED}
-        names |= {label(name): name for name in POINT_FIELDS if len(model.curves.counts)}
-        names |= {label(name): name for name in CELL_FIELDS if model.surfaces is not None}
-        self._fields = names
-        self._field = gui.add_dropdown("field", (NO_FIELD, *names))
+        self._fields = fields_of(model)
+        self._field = gui.add_dropdown("field", (NO_FIELD, *self._fields))
         self._legend = gui.add_html("")
         self._forces = gui.add_checkbox("contact forces", True, visible=model.touch is not None)
         gui.add_button("fit the view").on_click(lambda _: self._ask_fit())
@@ -228,18 +225,7 @@ class Viewer:
 
     def _frame(self, state, field: str) -> Frame:
         """Return the frame of a state with the values of a field, by its label."""
-        points, drawing, values = state.points().reshape(-1, 3), self.stage.drawing, None
-        name = self._fields.get(field)
-        if name == SPEED:
-            values = np.linalg.norm(state.velocities().reshape(-1, 3), axis=1)
-        elif name in CELL_FIELDS:
-            values = drawing.at_points(cell_fields(self.model, state, [name])[name].ravel())
-        elif name is not None:
-            values = point_fields(self.model, state, [name])[name].ravel()
-        moves = self.model.obstacles is not None and self.model.obstacles.moved.any()
-        obstacles = first_world(state.obstacle_points()) if moves else None
-        contacts = self.model.contacts(state) if self._forces.value and self.model.touch is not None else None
-        return Frame(state.time, points, values, obstacles, contacts)
+        return frame_of(self.model, self.stage.drawing, state, self._fields.get(field), contacts=self._forces.value)
 
     def _keep(self, state) -> None:
         """Keep every `_interval`-th state for `save`; drop every second one above KEPT."""

@@ -19,7 +19,28 @@ SPEED = "speed [m/s]"
 NO_FIELD = "none"
 
 
-class Recording:
+class Frames:
+    """Frames in the order of time; a subclass has `__len__` and `frame`."""
+
+    def frame(self, k: int, field: str = NO_FIELD) -> Frame:
+        """Return frame k with the values of a field, given by its label."""
+        raise NotImplementedError
+
+    def range(self, field: str) -> tuple[float, float]:
+        """Return the least and largest value of a field, over SAMPLES frames of the run."""
+        return value_range(self.frame(k, field).values for k in self.sample(SAMPLES))
+
+    def typical_force(self) -> float:
+        """Return the median over SAMPLES frames of the largest contact force [N]; 0 without contacts."""
+        sample = [largest_force(self.frame(k).contacts) for k in self.sample(SAMPLES)]
+        return float(np.median([force for force in sample if force > 0.0] or [0.0]))
+
+    def sample(self, count: int) -> list[int]:
+        """Return at most `count` frame numbers at equal distances, first and last included."""
+        return sorted({round(k) for k in np.linspace(0, len(self) - 1, min(count, len(self)))})
+
+
+class Recording(Frames):
     """Frames of DIR/trajectory.h5.
 
     Args:
@@ -99,20 +120,6 @@ class Recording:
             None if reader.obstacle_points is None else first_world(reader.obstacle_points[k]),
             None if reader.contacts is None else reader.contacts[k],
         )
-
-    def range(self, field: str) -> tuple[float, float]:
-        """Return the least and largest value of a field, over SAMPLES frames of the run."""
-        return value_range(self._values(k, field) for k in self.sample(SAMPLES))
-
-    def typical_force(self) -> float:
-        """Return the median over SAMPLES frames of the largest contact force [N]; 0 without contacts."""
-        contacts = self._reader.contacts
-        sample = [] if contacts is None else [largest_force(contacts[k]) for k in self.sample(SAMPLES)]
-        return float(np.median([force for force in sample if force > 0.0] or [0.0]))
-
-    def sample(self, count: int) -> list[int]:
-        """Return at most `count` frame numbers at equal distances, first and last included."""
-        return sorted({round(k) for k in np.linspace(0, len(self) - 1, min(count, len(self)))})
 
     def close(self) -> None:
         """Close the file."""
