@@ -7,7 +7,8 @@
 Describe a scene: `Scene`, `Circle`, `Ellipse`, `Rectangle`, `Ribbon`, `Stiffness`, `Material`, `Law`.
 Supports, motions, controls: `Motion`, `Grip`, `Controls`, `Samples`.
 Obstacles, fluid: `Plane`, `Sphere`, `Capsule`, `Box`, `Mesh`, `Viscous`, `Granular`.
-Run it: `simulate`, `Viewer`, `Dynamics`, `Statics`, `PathAnalysis`, `StopCriterion`, `Displacement`, `Check`, `Recorder`, `bench`.
+Run it: `simulate`, `Dynamics`, `Statics`, `PathAnalysis`, `StopCriterion`, `Displacement`, `Check`, `Recorder`, `bench`.
+See it: `Viewer`, `movie`.
 Loops: `Integrator`, `AdaptiveStepper`, `statics`, `continuation`, `stability`.
 Query it: `Model`, `State`, `quantities`.
 Geometry, files: `meshes`, `rest_shapes`, `io`, `read_mesh`, `read_curves`.
@@ -34,6 +35,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time see `_HOME`
     from ddg_warp.postprocess import quantities
     from ddg_warp.run import bench
     from ddg_warp.run.check import Check
+    from ddg_warp.run.movie import movie
     from ddg_warp.run.recorder import Recorder
     from ddg_warp.run.simulate import simulate
     from ddg_warp.scene.descriptions import Dynamics, PathAnalysis, Statics
@@ -93,6 +95,7 @@ __all__ = [
     "continuation",
     "io",
     "meshes",
+    "movie",
     "quantities",
     "read_curves",
     "read_mesh",
@@ -137,6 +140,7 @@ _HOME = {
     "PathAnalysis": "scene.descriptions",
     "Viewer": "view.live",
     "Viscous": "scene.drag",
+    "movie": "run.movie",
     "simulate": "run.simulate",
     "read_curves": "io:read",
     "read_mesh": "io.mesh_read",

@@ -97,6 +97,7 @@ def parser(arguments: list[str]) -> Parser:
         help="record these too, such as velocities,directors,contacts,axial_force,shell_energy",
     )
     run.add_argument("--json", type=Path, metavar="FILE", help="write the summary to FILE too")
+    run.add_argument("--movie", type=Path, metavar="FILE", help="write a movie of the run to FILE.mp4 (extra `render`)")
     if arguments[:1] == ["run"] and len(arguments) > 1 and not arguments[1].startswith("-"):
         add_parameters(run.add_argument_group(f"parameters of {arguments[1]}"), load_scene(arguments[1]))
 
@@ -183,6 +184,11 @@ def run_scene(chosen: argparse.Namespace) -> int:
     module, name = load_scene(chosen.scene), scene_name(chosen.scene)
     settings, run_settings = settings_of(chosen, module, name)
     require_device(chosen.device)
+    if chosen.movie is not None:
+        from ddg_warp.run.movie import check_packages, movie
+
+        with refused():
+            check_packages()
 
     from ddg_warp.run.simulate import simulate
     from ddg_warp.run.summary import write_json
@@ -193,6 +199,9 @@ def run_scene(chosen: argparse.Namespace) -> int:
             raise InputError("--resume goes on with a run, and --force replaces it: give one of them")
         if ended := finished(directory, chosen.duration):
             print(ended)
+            if chosen.movie is not None:
+                with refused():
+                    movie(directory, chosen.movie, title=name)
             return DONE
     scene = built(module, name, settings)
     with RunDirectory(directory) as run_directory:
@@ -213,6 +222,9 @@ def run_scene(chosen: argparse.Namespace) -> int:
             )
         if chosen.json is not None:
             write_json(chosen.json, result.summary())
+    if chosen.movie is not None:
+        with refused():
+            movie(directory, chosen.movie, title=name)
     say(result, directory)
     return FAILED if result.failure or any(check.failed for check in result.checks) else DONE
 

@@ -11,13 +11,13 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from ddg_warp.io.colors import CONTACT, SCALE
+from ddg_warp.io.colors import CONTACT
 from ddg_warp.io.contact_records import Contacts
 from ddg_warp.io.shapes import Shapes
-from ddg_warp.run.panel import DPI, GREY, LOAD, MARGIN, Panel, RenderedPanel
+from ddg_warp.run.panel import DPI, GREY, LOAD, MARGIN, TIME_COLORS, Panel, RenderedPanel
 from ddg_warp.run.render import View, available
 from ddg_warp.view.drawing import Drawing, directions, largest_force
 from ddg_warp.view.drawing import arrows as contact_arrows
@@ -39,7 +39,6 @@ LIGHT_GREY = (0.78, 0.78, 0.78, 1.0)
 TITLE = 11  # letters of a title in an inch
 STABILITY = {"stable": (False, "-"), "unstable": (True, "--")}
 SPECIAL = {"limit point": "o", "bifurcation": "D"}
-TIME_COLORS = LinearSegmentedColormap.from_list("time", SCALE)
 MARKERS = "osD^vP"
 
 

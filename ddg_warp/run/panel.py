@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import to_rgba_array
+from matplotlib.colors import LinearSegmentedColormap, to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
+from ddg_warp.io.colors import SCALE
 from ddg_warp.io.rod_tubes import SIDES, tube_faces, tube_points
 from ddg_warp.io.shapes import Shapes
 from ddg_warp.run.render import Canvas, View
@@ -19,6 +20,7 @@ WIDEST = 0.72  # largest visible width over diagonal of a box in a panel
 MARGIN = 0.06  # of the size, around the rods
 FIELD_COLOR = "#c9bfd6"
 GREY = "0.35"
+TIME_COLORS = LinearSegmentedColormap.from_list("time", SCALE)
 MARK, LOAD = (0.15, 0.15, 0.15), (0.1, 0.55, 0.3)  # RGB of fixed nodes and of applied forces
 MARK_SIZE = 0.011  # radius of a mark over the size of the panel
 CLOSE = 1.45  # zoom of a solid scene without axes

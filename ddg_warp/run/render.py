@@ -133,6 +133,9 @@ class Canvas:
             opacity: Opacity.
             closed: Whether only the outside is drawn, where triangles are counter-clockwise.
         """
+        if not len(faces):
+            self.plotter.remove_actor(name, render=False)
+            return
         if normals is None:
             normals = vertex_normals(SimpleNamespace(triangles=faces), points)
         cells = np.insert(faces, 0, 3, axis=1).ravel() if np.ndim(faces) == 2 else faces
@@ -150,6 +153,7 @@ class Canvas:
             specular=0.15,
             culling="back" if closed else None,
             reset_camera=False,
+            render=False,
         ).prop.interpolation = "Phong"
 
     def tubes(self, name: str, points: np.ndarray, curves: Curves, color, thinnest: float = 0.0) -> None:
@@ -174,7 +178,7 @@ class Canvas:
     def arrows(self, name: str, ends: np.ndarray, color) -> None:
         """Draw arrows with start and end (n, 2, 3) [m] instead of the last ones of a name."""
         if not len(ends):
-            self.plotter.remove_actor(name)
+            self.plotter.remove_actor(name, render=False)
             return
         size = float(np.sqrt(np.prod(self.view.size)))
         start, vector = ends[:, 0], ends[:, 1] - ends[:, 0]
@@ -197,6 +201,7 @@ class Canvas:
     def image(self) -> np.ndarray:
         """Return the image, shape (height, width, 3), uint8."""
         self.plotter.camera.reset_clipping_range()
+        self.plotter.render()
         return np.array(self.plotter.screenshot(None, return_img=True))[..., :3]
 
     def close(self) -> None:

@@ -54,6 +54,7 @@ class Result:
         learned: Data that the scene's check learned from the run, for its plot; None without.
         checks: Checks of the run (`Check`), if a check was given.
         name, parameters: Name of the scene and parameters of its `build`, from the provenance.
+        directory: Directory of the recorded run; None if it was not recorded.
     """
 
     scene: Scene
@@ -76,6 +77,7 @@ class Result:
     checks: list[Check] = field(default_factory=list)
     name: str = "scene"
     parameters: dict = field(default_factory=dict)
+    directory: Path | None = None
 
     def __repr__(self) -> str:
         reached = f"{self.times[0]:g} to {self.times[-1]:g}" if len(self.times) else "none"
@@ -244,6 +246,7 @@ def simulate(
     about = provenance or {}
     result = Result(scene, model, model.state(), dt=dt, name=about.get("scene", "scene"), times=[])
     result.parameters = dict(about.get("parameters", {}))
+    result.directory = Path(out if out is not None else resume) if (out, resume) != (None, None) else None
     if scene.initial:
         try:
             result.state = scene.initial(model)  # may set parameters, hence also in a resumed run

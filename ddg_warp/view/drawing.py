@@ -189,8 +189,8 @@ class Drawing:
         with np.errstate(invalid="ignore"):
             return np.bincount(corners, np.repeat(values, 3), len(self._corners)) / self._corners
 
-    def camera(self, *frames: Frame) -> dict[str, np.ndarray]:
-        """Return eye position and target of a camera that sees all points and bounded obstacles of some frames [m].
+    def extent(self, *frames: Frame) -> tuple[np.ndarray, np.ndarray]:
+        """Return all points and bounded obstacles of some frames [m], (n, 3), and the `directions` of their view.
 
         A scene in the plane y = const. is seen along y.
         """
@@ -199,10 +199,13 @@ class Drawing:
             bounded = self.obstacles.kinds != PLANE
             bodies = [self.obstacles.surface(frame.obstacles, bounded)[0] for frame in frames]
             points = np.concatenate([points, *bodies])
-        low, high = points.min(0), points.max(0)
-        center = 0.5 * (low + high)
-        flat = high[1] - low[1] <= 1e-6 * self.size
-        right, up, toward = directions(*((0.0, -0.5 * np.pi) if flat else (ELEVATION, AZIMUTH)))
+        flat = np.ptp(points[:, 1]) <= 1e-6 * self.size
+        return points, directions(*((0.0, -0.5 * np.pi) if flat else (ELEVATION, AZIMUTH)))
+
+    def camera(self, *frames: Frame) -> dict[str, np.ndarray]:
+        """Return eye position and target of a camera that sees the `extent` of some frames [m]."""
+        points, (right, up, toward) = self.extent(*frames)
+        center = 0.5 * (points.min(0) + points.max(0))
         offset = points - center
         aside = np.maximum(np.abs(offset @ right), np.abs(offset @ up))
         distance = float(np.max(offset @ toward + MARGIN * aside / np.tan(0.5 * FIELD_OF_VIEW))) or self.size

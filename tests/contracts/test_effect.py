@@ -7,6 +7,7 @@ import inspect
 from collections import defaultdict
 from functools import cache
 
+import effects_of_movies  # noqa: F401  (adds its calls)
 import effects_of_solvers  # noqa: F401  (adds its calls)
 import numpy as np
 import pytest
