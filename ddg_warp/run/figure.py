@@ -13,6 +13,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from ddg_warp.io.colors import CONTACT
 from ddg_warp.io.contact_records import Contacts
@@ -232,29 +233,36 @@ def error_plot(
 
 
 def levels_plot(path, names: list[str], marks: Mapping[str, list], usual: list[float], errors: list[float]) -> None:
-    """Draw times on a logarithmic axis, a row a name: markers for levels, crosses for defaults.
+    """Draw errors of defaults, and times of defaults and to each level, on logarithmic axes side by side, a row a name.
 
     Args:
         path: The picture to write; its suffix is the format.
         names: Names of the rows, the first on top.
         marks: Level -> time [s] of every name, None if the level is not reached.
         usual: Times of the defaults [s].
-        errors: Relative errors of the defaults.
+        errors: Relative errors of the defaults, NaN where unknown.
     """
-    figure = Figure(figsize=(7.5, 1.0 + 0.24 * len(names)), layout="constrained")
-    plot, height = figure.add_subplot(), -np.arange(len(names))
+    figure = Figure(figsize=(8.0, 1.0 + 0.2 * len(names)), layout="constrained")
+    (error_axes, time_axes), height = figure.subplots(1, 2, sharey=True), -np.arange(len(names))
+    error_axes.semilogx(errors, height, "x", color="k", markersize=5)
     for k, (level, times) in enumerate(marks.items()):
         values = np.array([np.nan if time is None else time for time in times])
         color = TIME_COLORS(0.3 + 0.7 * k / max(1, len(marks) - 1))
-        plot.semilogx(values, height, MARKERS[k], color=color, markersize=6 - k, label=level, alpha=0.85)
-    plot.semilogx(usual, height, "x", color="k", markersize=6, label="defaults")
-    for x, y, error in zip(usual, height, errors, strict=True):
-        plot.annotate(f"{error:.0e}", (x, y), xytext=(5, -3), textcoords="offset points", fontsize=7, color=GREY)
-    plot.set_yticks(height, names, fontsize=8)
-    plot.set_xlabel("time [s]")
-    plot.grid(color="0.92", linewidth=0.6)
-    plot.spines[["top", "right"]].set_visible(False)
-    plot.legend(frameon=False, fontsize=8, ncols=len(marks) + 1, loc="lower left", bbox_to_anchor=(0.0, 1.0))
+        time_axes.semilogx(values, height, MARKERS[k], color=color, markersize=6 - k, label=f"to {level}", alpha=0.85)
+    time_axes.semilogx(usual, height, "x", color="k", markersize=5, label="defaults")
+    error_axes.set_yticks(height, names, fontsize=7.5)
+    error_axes.set_ylim(height[-1] - 0.8, 0.8)
+    error_axes.set_xlabel("relative error of the defaults")
+    time_axes.set_xlabel("time [s]")
+    for plot in (error_axes, time_axes):
+        low, high = np.log10(plot.get_xlim())
+        plot.set_xlim(10.0 ** np.floor(low), 10.0 ** np.ceil(high))
+        plot.xaxis.set_minor_formatter(NullFormatter())
+        plot.grid(color="0.92", linewidth=0.6)
+        plot.set_axisbelow(True)
+        plot.tick_params(axis="y", length=0, labelleft=plot is error_axes)
+        plot.spines[["top", "right", "left"]].set_visible(False)
+    figure.legend(frameon=False, fontsize=8, ncols=len(marks) + 1, loc="outside upper right")
     _save(figure, path)
 
 
