@@ -4,6 +4,7 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
+from ddg_warp.io.colors import on_scale
 
 SOURCE = "Sze, Liu and Lo 2004, Abaqus S4R"
 
@@ -44,6 +45,20 @@ def add_octant(scene: ddg.Scene, flat: np.ndarray, triangles: np.ndarray, radius
     scene.symmetry(index, side(flat, 0, 1.0), "x")
     scene.symmetry(index, side(flat, 1, 0.0), "z")
     return index
+
+
+def octants(result, frames, chart: dict) -> dict:
+    """Return options of the picture of a cylinder of eight octants: before and under the load, side by side with a chart."""
+    triangles, times = result.model.surfaces.triangles, (min(frames), max(frames))
+    signs = np.stack(np.meshgrid(*[(1.0, -1.0)] * 3, indexing="ij"), -1).reshape(-1, 1, 3)[1:]
+    count = len(frames[times[0]])
+    cells = (triangles + count * np.arange(len(signs))[:, None, None]).reshape(-1, 3)
+    bodies = {}
+    for k, time in enumerate(times):
+        shade = np.tile(on_scale(np.array([float(k)]), 0.0, 1.0), (len(cells), 1))
+        bodies[time] = (signs * frames[time]).reshape(-1, 3), cells, shade
+    shapes = {t: frames[t] for t in times}
+    return {"points_by_time": shapes, "bodies": bodies, "side_by_side": True, "chart": chart, "angles": (25.0, -50.0)}
 
 
 def displacement(model, state, vertex: int, axis: int) -> float:

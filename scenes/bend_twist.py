@@ -9,6 +9,7 @@ inextensible Kirchhoff rod, by a spectral method and by a determinant.
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp.postprocess.mode_shape import buckled_points
 
 LENGTH = 1.0  # m
 B, C = 1.0, 2.0 / 3.0  # bending and twisting stiffness [N m^2] at a Poisson's ratio of 0.5
@@ -103,6 +104,12 @@ def check(result) -> list[ddg.Check]:
         ddg.Check(f"critical weight {i} [B/L^3]", branch.flip(0.8 * G, 1.2 * G), G, 0.02, SOURCE, relative=True)
         for i, G in enumerate(flips, 1)
     ]
+
+
+def picture(result, frames) -> dict:
+    """Draw the lowest mode, out of the plane, next to the planar equilibrium."""
+    mode = buckled_points(result.model, result.state, 0.08 * LENGTH)
+    return {"points_by_time": {0.0: result.state.points(), 1.0: mode}, "label": "amplitude of the lowest mode"}
 
 
 def benchmark() -> ddg.bench.Study:

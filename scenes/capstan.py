@@ -14,7 +14,7 @@ import numpy as np
 
 import ddg_warp as ddg
 from ddg_warp.run.check import once_reached
-from ddg_warp.scenes import _many_rods
+from ddg_warp.scenes import _many_rods, _pictures
 
 DRUM = 0.05  # m, radius
 RADIUS = 0.001  # m
@@ -177,5 +177,29 @@ def benchmark() -> ddg.bench.Study:
 
 
 def picture(result, frames) -> dict:
-    """Draw the rod on the drum at the start and the end."""
-    return {"points_by_time": {t: frames[t] for t in (min(frames), max(frames))}}
+    """Draw the rod on the drum, colored by the tension, and the tension along the rod against the formula."""
+    tension = _pictures.at_points(result.model, result.state, "axial_force")
+    points = result.state.points()
+    around = np.unwrap(np.arctan2(points[:, 0], points[:, 2]))
+    arc = np.degrees(around - around[0])
+    slack, friction = float(np.linalg.norm(result.scene.loads[0].force)), result.scene.contact_settings.friction
+    wound = np.abs(np.hypot(points[:, 0], points[:, 2]) - AROUND) < RANGE
+    start = arc[wound][0]
+    return {
+        "points_by_time": {max(frames): frames[max(frames)]},
+        "values": tension,
+        "label": "tension [N]",
+        "chart": {
+            "lines": [
+                (
+                    "slack end times exp(µ angle)",
+                    arc[wound],
+                    slack * np.exp(friction * np.radians(arc[wound] - start)),
+                    "-",
+                ),
+                ("along the rod", arc, tension, "o"),
+            ],
+            "x": "angle about the drum [degrees]",
+            "y": "tension [N]",
+        },
+    }

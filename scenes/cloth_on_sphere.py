@@ -66,3 +66,9 @@ def check(result) -> list[ddg.Check]:
     names = ("force of obstacles less inertia over weight",)
     checks = _many_rods.checks(result, REFUSED)
     return checks + once_reached(result, RESTS, names, lambda: [_many_rods.weight_check(result, 0.1)])
+
+
+def picture(result, frames) -> dict:
+    """Draw the cloth before the fall, on the ball, and in folds, side by side."""
+    times = list(frames)
+    return {"points_by_time": {t: frames[t] for t in (times[0], times[2], times[-1])}, "side_by_side": True}

@@ -75,3 +75,9 @@ def check(result) -> list[ddg.Check]:
         *_many_rods.checks(result),
         ddg.Check("couples of both ends, mean over the run", ratio, 1.0, 0.05, "balance of moments", True),
     ]
+
+
+def picture(result, frames) -> dict:
+    """Draw the cylinder before, halfway and at the end, side by side."""
+    times = list(frames)
+    return {"points_by_time": {t: frames[t] for t in (times[0], times[2], times[-1])}, "side_by_side": True}

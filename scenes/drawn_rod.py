@@ -140,4 +140,22 @@ def picture(result, frames) -> dict:
     rows = {t: points + [0.0, -0.06 * i, 0.0] for i, (t, points) in enumerate(sorted(frames.items()))}
     wide = 0.06 * len(frames) + 0.06
     floor = np.column_stack([1.4 * corners[:, 0] - 0.1, 0.09 - wide * corners[:, 1], 0.0 * corners[:, 0]])
-    return {"points_by_time": rows, "bodies": {min(frames): (floor, cells)}}
+    drawn_by, turn = 1e3 * np.array(result.series["drawn"]), int(np.argmax(result.series["drawn"]))
+    pull, steps = np.array(result.series["force"]), len(result.times)
+    exact = [expected(1e-3 * u, i > turn) for i, u in enumerate(drawn_by)]
+    laid = np.array(result.times) > LAID - 1e-9
+    return {
+        "points_by_time": rows,
+        "bodies": {min(frames): (floor, cells)},
+        "loads": None,
+        "note": "from the back to the front by load parameter",
+        "chart": {
+            "lines": [
+                ("exact", drawn_by[laid], np.array(exact)[laid], "-"),
+                ("drawn", drawn_by[: turn + 1], pull[: turn + 1], "o"),
+                ("let back", drawn_by[turn:steps], pull[turn:steps], "s"),
+            ],
+            "x": "displacement of the end [mm]",
+            "y": "force over µ w L",
+        },
+    }

@@ -113,6 +113,16 @@ def check(result) -> list[ddg.Check]:
     ]
 
 
+def picture(result, frames) -> dict:
+    """Draw the spring at rest and stretched, side by side."""
+    n = int(result.model.curves.counts[0]) - 1
+    return {
+        "points_by_time": [(0.0, wire(1.0, TURNS, n)[0]), (1.0, result.state.points())],
+        "names": ["natural shape", "stretched between clamps"],
+        "side_by_side": True,
+    }
+
+
 def benchmark() -> ddg.bench.Study:
     """Study the axial force over the nodes of ten turns."""
     return ddg.bench.Study({"n": (100, 200, 400, 800)}, "axial force")

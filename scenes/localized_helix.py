@@ -16,6 +16,7 @@ LENGTH = 9.29  # m
 B, C = 1.345, 0.789  # bending and twisting stiffness [N m^2]
 TAUT = 80.0  # N, initial tension above M^2 / 4B, at which the twisted rod is straight
 NUDGE = 0.1  # N, in the middle; localises the buckle
+SHOWN = 1.5  # m, half the length of the picture
 SOURCE = "localised helix of the infinite rod (Coyne 1990)"
 
 
@@ -104,6 +105,23 @@ def check(result) -> list[ddg.Check]:
     tolerance = min(ddg.Check.COARSEST, 0.04 * max(0.25, (400.0 / (result.model.curves.counts[0] - 1)) ** 2))
     names = ("largest angle [rad]", "width of the envelope [m]", "moment [N m]", "tension [N]")
     return [ddg.Check(*entry, tolerance, SOURCE, relative=True) for entry in zip(names, measured, values, strict=True)]
+
+
+def picture(result, frames) -> dict:
+    """Draw the helix in the middle, with most of the ends cut off, and the angle of the tangent along the rod."""
+    points, (s, angle) = result.state.points().copy(), envelope(result.state)
+    middle = points[len(points) // 2, 0]
+    points[:, 0] = points[:, 0].clip(middle - SHOWN, middle + SHOWN)
+    return {
+        "points_by_time": {1.0: points},
+        "fixed": None,
+        "note": f"the middle {2.0 * SHOWN:g} m",
+        "chart": {
+            "lines": [("", s, np.degrees(angle), "-")],
+            "x": "arc length from the middle [m]",
+            "y": "angle to the axis [degrees]",
+        },
+    }
 
 
 def benchmark() -> ddg.bench.Study:

@@ -159,7 +159,7 @@ def picture(result, frames) -> dict:
 
     n = len(result.state.points()) - 1
     ball, triangles = meshes.sphere(2)
-    balls = poses(n)[:, 2 :: max(1, n // 8)].reshape(-1, 1, 3) + RADIUS * ball
+    balls = poses(n)[:, 2 :: max(1, n // 8)].reshape(-1, 1, 3) + 1.6 * RADIUS * ball
     cells = (triangles[None] + len(ball) * np.arange(len(balls))[:, None, None]).reshape(-1, 3)
     shapes = {0.0: result.model.state().points()}
     for due in APART * (1.0 + np.arange(len(POSES))):

@@ -67,6 +67,13 @@ def check(result) -> list[ddg.Check]:
     return [ddg.Check(name, compliance(result.model), LINEAR, 0.04, SOURCE, relative=True)]
 
 
+def picture(result, frames) -> dict:
+    """Draw the whole cylinder before and under the load, and the displacement under the force."""
+    load = -4.0 * float(result.scene.shell_loads[0].force[0, 0])
+    lines = [("", result.series["inwards"], 1e-3 * load * np.array(result.times), "-")]
+    return _sze.octants(result, frames, {"lines": lines, "x": "displacement inwards [m]", "y": "force [kN]"})
+
+
 def benchmark() -> ddg.bench.Study:
     """Study the compliance under a small force over meshes and membranes."""
     return ddg.bench.Study(

@@ -3,6 +3,8 @@
 Case 3.5 of Sze, Liu and Lo (2004): bending first, then, past half of the load, a jump of stiffness as the wall straightens.
 """
 
+import numpy as np
+
 import ddg_warp as ddg
 from ddg_warp.scenes import _sze
 
@@ -38,6 +40,23 @@ def observe(model, state) -> dict[str, float]:
 def check(result) -> list[ddg.Check]:
     """Check the displacement under the force against the table, to 1 % at 16 cells."""
     return _sze.table_checks(result, TABLE, {"radial": "radial displacement [m]"}, 0.01)
+
+
+def picture(result, frames) -> dict:
+    """Draw the whole cylinder before and under the load, and the displacement under the force against the table."""
+    force = 1e-3 * FORCE
+    return _sze.octants(
+        result,
+        frames,
+        {
+            "lines": [
+                ("under the force", result.series["radial"], force * np.array(result.times), "-"),
+                ("Sze, Liu and Lo", [values[0] for values in TABLE.values()], force * np.array(list(TABLE)), "o"),
+            ],
+            "x": "radial displacement [m]",
+            "y": "force [kN]",
+        },
+    )
 
 
 def benchmark() -> ddg.bench.Study:

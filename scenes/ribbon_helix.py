@@ -10,6 +10,7 @@ strains are uniform and a force and a moment along its axis hold it.
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp.geometry import meshes
 
 RADIUS = 0.1  # m
 LENGTH = 0.5  # m
@@ -114,6 +115,23 @@ def check(result) -> list[ddg.Check]:
         ),
         ddg.Check("distance from the cylinder [R]", away, 0.0, min(ddg.Check.COARSEST, 10.0 / n**2), SOURCE),
     ]
+
+
+def picture(result, frames) -> dict:
+    """Draw the strip in full width on the cylinder."""
+    points, section = result.state.points(), result.model.scene.batches[0].section
+    width, side = np.sqrt(12.0 * section.EI1 / section.EA), result.state.directors()
+    side = np.concatenate([side[:1], 0.5 * (side[1:] + side[:-1]), side[-1:]])[:, None]
+    edges = np.linspace(-0.5, 0.5, 9)[:, None] * np.ones(3) * width
+    strip = (points[:, None] + edges * side).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(len(points) - 1), np.arange(8), indexing="ij")
+    first = (9 * i + j).ravel()
+    cells = np.concatenate([np.stack([first, first + 9, first + 10], 1), np.stack([first, first + 10, first + 1], 1)])
+    ring, around = meshes.cylinder(48, 1, 0.98 * RADIUS, 1.2 * np.ptp(strip[:, 2]))
+    ring = ring + [0.0, 0.0, np.mean(strip[:, 2]) - np.mean(ring[:, 2])]
+    shades = np.concatenate([np.full((len(around), 3), 0.8), np.tile([0.82, 0.29, 0.36], (len(cells), 1))])
+    body = np.concatenate([ring, strip]), np.concatenate([around, cells + len(ring)]), shades
+    return {"points_by_time": {1.0: points}, "bodies": {1.0: body}, "angles": (18.0, 60.0), "fixed": None}
 
 
 def benchmark() -> ddg.bench.Study:

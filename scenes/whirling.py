@@ -14,6 +14,7 @@ SECTION = ddg.Circle(radius=0.005)
 MATERIAL = ddg.Material(young=2.0e11, poisson=0.3, density=7800.0)
 CRITICAL = {"pinned-pinned": 9.869604401, "clamped-free": 3.516015269, "clamped-clamped": 22.37328545}
 SOURCE = "first bending frequency"
+DEFLECTIONS = 10.0  # magnification in the picture
 EXACT = "shaft with one mode"
 
 
@@ -144,6 +145,24 @@ def check(result) -> list[ddg.Check]:
         measured = critical_rate(support, edges, device=model.device)
         checks.append(ddg.Check(f"critical rate, {support}", measured, value, space, SOURCE, True))
     return checks
+
+
+def picture(result, frames) -> dict:
+    """Draw the shaft at a few times with magnified deflection, and the deflection against the shaft of one mode."""
+    rate = result.model.scene.supports[-1].motion.angle(1.0)
+    frequency = CRITICAL["pinned-pinned"] * bending_rate()
+    times, amplitude = np.array(result.times), 1e3 * np.array(result.series["amplitude"])
+    bow = result.model.scene.batches[0].points[0, len(frames[min(frames)]) // 2, 2]
+    exact = 1e3 * np.abs(deflection(times, rate / frequency, frequency, bow, 1e-3 * amplitude[0]))
+    return {
+        "points_by_time": {t: points * [1.0, DEFLECTIONS, DEFLECTIONS] for t, points in list(frames.items())[:-1]},
+        "note": f"deflections times {DEFLECTIONS:g}",
+        "chart": {
+            "lines": [(EXACT, times, exact, "-"), ("this shaft", times[::8], amplitude[::8], "o")],
+            "x": "time [s]",
+            "y": "deflection of the middle [mm]",
+        },
+    }
 
 
 def benchmark() -> ddg.bench.Study:

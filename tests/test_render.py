@@ -5,6 +5,7 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
+from ddg_warp.io.curves import CurveSet
 from ddg_warp.io.shapes import Curves
 from ddg_warp.run import figure
 from ddg_warp.run.render import Canvas, View
@@ -103,3 +104,13 @@ def test_solid_pictures_are_rendered_with_a_ruler_and_marks(monkeypatch):
     green = (shown[..., 1] > shown[..., 0] + 30) & (shown[..., 1] > shown[..., 2] + 30)
     dark = (shown < 60).all(-1)
     assert green.sum() > 50 and dark.sum() > 50
+
+
+def test_curves_of_a_file_without_radii_are_rendered(monkeypatch):
+    figures = []
+    monkeypatch.setattr(figure, "_save", lambda figure, path: figures.append(figure))
+    points = np.linspace((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 9)
+    curves = CurveSet(points, np.array([9]), np.array([False]), None, "/hair")
+    figure.rods_picture(curves, {0.0: points}, "unused.png")
+    (image,) = figures[0].axes[0].get_images()
+    assert (image.get_array() != 255).any(-1).mean() > 1e-3

@@ -26,6 +26,8 @@ from ddg_warp.view.drawing import arrows as contact_arrows
 FLAT = 1e-3  # largest thickness over size of flat shapes
 ELEVATION, AZIMUTH = 18.0, -58.0  # of the eye [degrees]
 WIDTH, TALLEST = 7.0, 6.0  # of a picture and of its shapes [inches]
+LETTERS = 40  # of the labels of a legend with two columns at most
+NAME, LINE = 26, 0.17  # letters in a line of the name of a panel, and the height of a line [inches]
 PLOT, BAR, HEADER = 2.5, 0.6, 0.75  # heights of a chart, of a color bar below shapes, and the title [inches]
 SHARE, STACKED = (
     0.58,
@@ -34,7 +36,7 @@ SHARE, STACKED = (
 NARROWEST_AND_WIDEST = (0.5, 3.5)  # width over height of shapes
 RULER = 0.08  # height of the strip for scale bar and triad over the size of the shapes
 ARROW = 0.15  # length of the longest arrow over the size
-TICKS = 0.05  # least distance of ticks over the range
+TICKS = (0.05, 0.16)  # least distance of ticks over the range, upright and level
 ARROWS = {2: 9, 3: 4}  # of a field along the longest side of a picture, by its dimension
 LIGHT_GREY = (0.78, 0.78, 0.78, 1.0)
 TITLE = 11  # letters of a title in an inch
@@ -94,6 +96,8 @@ def rods_picture(
         chart: Arguments of `lines_plot`, such as force against displacement, or a followed path, drawn on the right or below.
     """
     curves = getattr(rods, "curves", rods)
+    if curves.radius is None:
+        curves = replace(curves, radius=np.zeros(np.sum(curves.counts)))
     frames = sorted(points_by_time.items()) if isinstance(points_by_time, Mapping) else list(points_by_time)
     if not frames:
         raise ValueError("there is no shape to draw: give the points of at least one time")
@@ -120,18 +124,25 @@ def rods_picture(
     if values is not None:
         norm = Normalize(np.nanmin(values), np.nanmax(values))
     rendered = len(axes) == 3 and available()
-    view = None
-    if rendered:
-        tips = [ends.reshape(-1, 3) for ends in arrows.values()]
-        directions_of_view = directions(*np.radians(angles))
-        view = View.fitted(np.concatenate([extents, *tips]), directions_of_view, NARROWEST_AND_WIDEST)
-        view = replace(view, low=view.low - [0.0, RULER * view.size.max()])
+    tips = [ends.reshape(-1, 3) for ends in arrows.values()]
     count = len(times) if side_by_side else 1
-    figure, cells, chart_cell, across = _layout(count, view, axes, low, high, chart)
+    contents = [np.concatenate([extents, *tips])]
+    if side_by_side:
+        contents = [
+            np.concatenate([shape, *(body for when, body, *_ in shown if when == time)])
+            for time, shape in zip(times, points, strict=True)
+        ]
+    low, high = contents[0].min(axis=0), contents[0].max(axis=0)
+    thickest = float(np.max(curves.radius, initial=0.0))
+    views = _views(contents, thickest, np.radians(angles), chart is not None) if rendered else None
+    figure, cells, chart_cell, across = _layout(count, views and views[0], axes, low, high, chart, names)
     if rendered:
         drawing = Drawing(curves, surfaces, worlds, points[0])
         width = round(DPI * across)
-        panels = [RenderedPanel(figure, cell, view, drawing, unit, (width, across)) for cell in cells]
+        panels = [
+            RenderedPanel(figure, cell, view, drawing, unit, (width, across))
+            for cell, view in zip(cells, views, strict=True)
+        ]
     else:
         panels = [Panel(figure, cell, axes, low, high, unit, angles) for cell in cells]
     for number, (time, shape) in enumerate(zip(times, points, strict=True)):
@@ -153,7 +164,7 @@ def rods_picture(
         if side_by_side:
             panel.bare()
             text = f"{label.partition(' [')[0]} {time:.3g} {label.partition('[')[2].rstrip(']')}"
-            panel.plot.set_title(text if names is None else textwrap.fill(names[number], 26), fontsize=9, color=GREY)
+            panel.plot.set_title(text if names is None else textwrap.fill(names[number], NAME), fontsize=9, color=GREY)
     for color, ends in arrows.items():
         panels[-1].arrows(ends, color)
     for number, panel in enumerate(panels):
@@ -177,7 +188,21 @@ def rods_picture(
     _save(figure, path)
 
 
-def _layout(count: int, view: View | None, axes: list[int], low, high, chart):
+def _views(contents: list[np.ndarray], radius: float, angles, charted: bool) -> list[View]:
+    """Return a view of each content, points (n, 3) with a radius [m], of one scale, with a strip for the ruler."""
+    room = WIDTH * (SHARE if charted else 1.0) / len(contents)
+    bounds = (max(NARROWEST_AND_WIDEST[0], min(1.0, room / TALLEST)), NARROWEST_AND_WIDEST[1])
+    views = [View.fitted(points, directions(*angles), bounds, radius) for points in contents]
+    half = 0.5 * np.max([view.size for view in views], axis=0)
+    centers = [0.5 * (view.low + view.high) for view in views]
+    strip = [0.0, 2.0 * RULER * half.max()]
+    return [
+        replace(view, low=center - half - strip, high=center + half)
+        for view, center in zip(views, centers, strict=True)
+    ]
+
+
+def _layout(count: int, view: View | None, axes: list[int], low, high, chart, names):
     """Return a figure, grid cells of its panels and of the chart right of or below them, and a panel's width [inches]."""
     aspect = view.aspect if view else 1.3
     if len(axes) == 2:
@@ -187,6 +212,7 @@ def _layout(count: int, view: View | None, axes: list[int], low, high, chart):
     across = WIDTH * (1.0 if chart is None or wide else SHARE) / count
     height = float(np.clip(across / aspect, 1.3, TALLEST)) + (0.5 if view is None else 0.0)
     total = (max(height + BAR, PLOT) if chart is not None and not wide else height + PLOT * wide) + HEADER
+    total += LINE * max((len(textwrap.wrap(name, NAME)) for name in names or []), default=0) * (count > 1)
     figure = Figure(figsize=(WIDTH, total), layout="constrained")
     if chart is None:
         return figure, list(figure.add_gridspec(1, count)), None, across
@@ -296,7 +322,7 @@ def _draw_lines(plot, lines: Iterable[tuple], x: str, y: str, title: str, log: b
     plot.grid(color="0.92", linewidth=0.6)
     plot.spines[["top", "right"]].set_visible(False)
     if labels != [""]:
-        plot.legend(frameon=False, fontsize=9)
+        _legend(plot)
 
 
 def path_plot(path, file, title: str = "", unit: str = "m") -> None:
@@ -342,7 +368,14 @@ def _draw_path(plot, path, unit: str) -> None:
     plot.set(xlabel=f"displacement [{unit}]", ylabel="load parameter")
     plot.grid(color="0.9", linewidth=0.6)
     plot.spines[["top", "right"]].set_visible(False)
-    plot.legend(frameon=False, fontsize=9)
+    _legend(plot)
+
+
+def _legend(plot) -> None:
+    """Add a legend above axes, where it covers nothing."""
+    columns = 2 if sum(map(len, plot.get_legend_handles_labels()[1])) <= LETTERS else 1
+    position = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.2}
+    plot.legend(frameon=False, fontsize=8, ncols=columns, columnspacing=1.0, **position)
 
 
 def _unstable(path) -> np.ndarray:
@@ -383,18 +416,18 @@ def _explain_times(
     if names is None or values is not None:
         bar.set_label(label, fontsize=9)
     if values is None:
-        ticks = apart(times) if names is None else times
+        ticks = apart(times, TICKS[below]) if names is None else times
         bar.set_ticks(ticks, labels=names or [f"{time:.3g}" for time in ticks])
     bar.ax.tick_params(labelsize=8)
     bar.outline.set_visible(False)
 
 
-def apart(times: np.ndarray) -> np.ndarray:
-    """Return the first and last of numbers, and the ones between at least TICKS of the range from others."""
+def apart(times: np.ndarray, least: float) -> np.ndarray:
+    """Return the first and last of numbers, and the ones between at least a fraction of the range from others."""
     low, high = np.min(times), np.max(times)
     kept = [low]
     for time in np.unique(times):
-        if min(time - kept[-1], high - time) >= TICKS * (high - low):
+        if min(time - kept[-1], high - time) >= least * (high - low):
             kept.append(time)
     return np.array(kept if high == low else [*kept, high])
 

@@ -157,7 +157,8 @@ def _images(
     newtons = frames.typical_force() if forces else 0.0
     points, axes = drawing.extent(*(frames.frame(k) for k in frames.sample(SAMPLED)))
     aspect = size[0] / size[1]
-    view = View.fitted(points, axes, (aspect / (1.0 - 2.0 * MARGIN),) * 2)
+    thickest = float(np.max(drawing.shapes.curves.radius, initial=0.0))
+    view = View.fitted(points, axes, (aspect / (1.0 - 2.0 * MARGIN),) * 2, thickest)
     middle, half = 0.5 * (view.low + view.high), 0.5 * view.size / [1.0, 1.0 - 2.0 * MARGIN]
     view = View(axes, middle - half, middle + half, view.depth)
     overlay = _overlay(view, size, scale, title)

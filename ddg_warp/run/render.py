@@ -70,12 +70,12 @@ class View:
     depth: float
 
     @classmethod
-    def fitted(cls, points: np.ndarray, axes: np.ndarray, aspects: tuple[float, float]) -> View:
-        """Return the view of points (n, 3) [m] whose width over height is within bounds."""
+    def fitted(cls, points: np.ndarray, axes: np.ndarray, aspects: tuple[float, float], radius: float = 0.0) -> View:
+        """Return the view of points (n, 3) and a radius around them [m] whose width over height is within bounds."""
         projected = points @ axes.T
         low, high = projected.min(0), projected.max(0)
         middle, half = 0.5 * (low + high)[:2], 0.5 * (high - low)[:2]
-        half = half + MARGIN * max(half.max(), np.finfo(float).tiny)
+        half = half + radius + MARGIN * max(half.max(), np.finfo(float).tiny)
         half = np.maximum(half, [aspects[0] * half[1], half[0] / aspects[1]])
         return cls(axes, middle - half, middle + half, 0.5 * float(low[2] + high[2]))
 
