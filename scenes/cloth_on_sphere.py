@@ -71,4 +71,7 @@ def check(result) -> list[ddg.Check]:
 def picture(result, frames) -> dict:
     """Draw the cloth before the fall, on the ball, and in folds, side by side."""
     times = list(frames)
-    return {"points_by_time": {t: frames[t] for t in (times[0], times[2], times[-1])}, "side_by_side": True}
+    return {
+        "points_by_time": {t: frames[t] for t in (times[0], times[len(times) // 3], times[-1])},
+        "side_by_side": True,
+    }

@@ -131,7 +131,7 @@ def picture(result, frames) -> dict:
     motion = result.scene.supports[0].motion
     base = [1e3 * motion.translation(t)[2] for t in result.times]
     return {
-        "points_by_time": {t: points * [1.0, 1.0, DEFLECTIONS] for t, points in list(frames.items())[3:]},
+        "points_by_time": {t: points * [1.0, 1.0, DEFLECTIONS] for t, points in list(frames.items())[-3:]},
         "note": f"deflections times {DEFLECTIONS:g}",
         "chart": {
             "lines": [

@@ -84,7 +84,7 @@ def picture(result, frames) -> dict:
     drop, force = (np.array(result.series[name]) for name in ("drop", "force"))
     _, at_peak = limit(result.series)
     times = sorted(frames)
-    times = times[0], min(times, key=lambda t: abs(t * drop[-1] - at_peak)), times[-1]
+    times = times[0], min(times, key=lambda t: abs(t * drop[-1] - at_peak)), times[-1]  # the first without a limit
     upright = {t: frames[t][:, [1, 2, 0]] * [1.0, 1.0, HEIGHTS] - [0.0, 0.0, HEIGHTS * RADIUS] for t in times}
     return {
         "points_by_time": upright,
@@ -92,7 +92,12 @@ def picture(result, frames) -> dict:
         "chart": {
             "lines": [
                 ("whole roof", drop, force, "-"),
-                ("limit load of Sze, Liu and Lo", [at_peak], [LIMIT[float(result.scene.shells[0].thickness)]], "o"),
+                (
+                    "limit load of Sze, Liu and Lo",
+                    [at_peak],
+                    [LIMIT.get(float(result.scene.shells[0].thickness), np.nan)],
+                    "o",
+                ),
             ],
             "x": "drop of the crown [mm]",
             "y": "force [N]",

@@ -1,5 +1,7 @@
 """Pictures with labels of modes, units, load parameter and stability, and with titles that fit."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -200,3 +202,42 @@ def test_titles_fit(drawn, plain):
         canvas = figure.FigureCanvasAgg(drawn[-1])
         title = drawn[-1].get_suptitle() and drawn[-1]._suptitle.get_window_extent(canvas.get_renderer())
         assert title.x1 < drawn[-1].bbox.x1, path
+
+
+# Scenes whose pictures are computed, at a small size, and whether every day; two steps of a motion are enough.
+COMPUTED = {
+    "axisymmetric_dome": ({"n": 20}, False),
+    "bilayer_strip": ({"cells": 2}, True),
+    "cable_on_table": ({"n": 40}, False),
+    "capstan": ({"n": 20}, False),
+    "cloth_on_sphere": ({"cells": 4}, False),
+    "cloth_twist": ({"around": 12, "along": 6}, False),
+    "crossed_beams": ({"n": 10}, False),
+    "drawn_rod": ({"n": 10, "load_steps": 10}, False),
+    "flagellum": ({"n": 10}, True),
+    "gridshell_dome": ({"rods": 3, "segments": 2}, True),
+    "hanging_chain": ({"n": 10}, False),
+    "helical_spring": ({"n": 200}, True),
+    "hinged_roof": ({"n": 4, "steps": 4, "thickness": 10.0}, False),
+    "localized_helix": ({"n": 100}, False),
+    "parachute": ({"rings": 3, "lines": 6}, True),
+    "pinched_cylinder": ({"n": 4, "steps": 1, "load": 1e-3}, False),
+    "pullout_cylinder": ({"n": 4}, False),
+    "ribbon_helix": ({"n": 25}, True),
+    "sphere_indentation": ({"rings": 6}, True),
+    "vibration": ({"n": 10}, False),
+    "whirling": ({"n": 10}, True),
+}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if daily else pytest.mark.slow) for name, (_, daily) in COMPUTED.items()]
+)
+def test_computed_pictures_are_drawn_for_small_and_short_runs(name, tmp_path):
+    module = load_scene(name)
+    scene = module.build(**COMPUTED[name][0])
+    dt = getattr(scene.analysis, "dt", None)
+    observed = SimpleNamespace(**{key: value for key, value in vars(module).items() if key != "check"})
+    options = {"dt": dt, "duration": 2.0 * dt} if dt else {}
+    simulate(scene, device="cpu", out=tmp_path, usd=False, module=observed, progress=False, **options)
+    assert (tmp_path / "picture.png").stat().st_size > 5_000
