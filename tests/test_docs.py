@@ -26,6 +26,7 @@ OPTIONAL = {
     "gymnasium": "gymnasium_env",
     "jax": "import jax",
     "pandas": "import pandas",
+    "pyvista": "ddg.movie",
 }  # packages, and text of the examples that need them
 MISSING = [name for name in OPTIONAL if importlib.util.find_spec(name) is None]
 RUN_PAGES = """

@@ -34,7 +34,7 @@ SHARE, STACKED = (
     1.9,
 )  # width of shapes left of a chart over the width of the picture, and aspect above which the chart is below
 NARROWEST_AND_WIDEST = (0.5, 3.5)  # width over height of shapes
-RULER = 0.08  # height of the strip for scale bar and triad over the size of the shapes
+RULER = 0.5  # height of the strip for scale bar and triad [inches]
 ARROW = 0.15  # length of the longest arrow over the size
 TICKS = (0.05, 0.16)  # least distance of ticks over the range, upright and level
 ARROWS = {2: 9, 3: 4}  # of a field along the longest side of a picture, by its dimension
@@ -195,7 +195,7 @@ def _views(contents: list[np.ndarray], radius: float, angles, charted: bool) -> 
     views = [View.fitted(points, directions(*angles), bounds, radius) for points in contents]
     half = 0.5 * np.max([view.size for view in views], axis=0)
     centers = [0.5 * (view.low + view.high) for view in views]
-    strip = [0.0, 2.0 * RULER * half.max()]
+    strip = [0.0, RULER / room * 2.0 * half[0]]
     return [
         replace(view, low=center - half - strip, high=center + half)
         for view, center in zip(views, centers, strict=True)
