@@ -132,7 +132,7 @@ def rods_picture(
             np.concatenate([shape, *(body for when, body, *_ in shown if when == time)])
             for time, shape in zip(times, points, strict=True)
         ]
-    low, high = contents[0].min(axis=0), contents[0].max(axis=0)
+    low, high = (bound(np.concatenate(contents), axis=0) for bound in (np.min, np.max))
     thickest = float(np.max(curves.radius, initial=0.0))
     views = _views(contents, thickest, np.radians(angles), chart is not None) if rendered else None
     figure, cells, chart_cell, across = _layout(count, views and views[0], axes, low, high, chart, names)
@@ -208,7 +208,7 @@ def _layout(count: int, view: View | None, axes: list[int], low, high, chart, na
     if len(axes) == 2:
         sides = (high - low)[axes] + 2.0 * MARGIN * np.max(high - low)
         aspect = float(np.clip(sides[0] / sides[1], *NARROWEST_AND_WIDEST))
-    wide = chart is not None and aspect > STACKED
+    wide = chart is not None and (aspect > STACKED or (view is None and len(axes) == 3))  # labels at the right, too
     across = WIDTH * (1.0 if chart is None or wide else SHARE) / count
     height = float(np.clip(across / aspect, 1.3, TALLEST)) + (0.5 if view is None else 0.0)
     total = (max(height + BAR, PLOT) if chart is not None and not wide else height + PLOT * wide) + HEADER
