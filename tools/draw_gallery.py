@@ -18,7 +18,8 @@ from ddg_warp.run.scene_registry import scene_files
 
 GALLERY = Path(__file__).parent / "results" / "gallery"
 TUTORIALS = Path(__file__).parent / "docs" / "tutorials"
-WIDTH = 560  # pixels
+WIDTH = 640  # pixels
+COLORS = 128  # of a picture; this way few pixels of a color, such as arrows, keep it
 
 
 def store(picture: Path, name: str) -> None:
@@ -26,7 +27,7 @@ def store(picture: Path, name: str) -> None:
     with Image.open(picture) as image:
         size = WIDTH, round(image.height * WIDTH / image.width)
         small = image.convert("RGB").resize(size, Image.Resampling.LANCZOS)
-        small.quantize(64).save(GALLERY / f"{name}.png", optimize=True)
+        small.quantize(COLORS, Image.Quantize.MAXCOVERAGE).save(GALLERY / f"{name}.png", optimize=True)
 
 
 def draw_scene(scene: str, limit: float) -> str:

@@ -26,7 +26,7 @@ from ddg_warp.view.drawing import arrows as contact_arrows
 FLAT = 1e-3  # largest thickness over size of flat shapes
 ELEVATION, AZIMUTH = 18.0, -58.0  # of the eye [degrees]
 WIDTH, TALLEST = 7.0, 6.0  # of a picture and of its shapes [inches]
-LETTERS = 40  # of the labels of a legend with two columns at most
+LETTERS = 34  # of the labels of a legend with two columns at most
 NAME, LINE = 26, 0.17  # letters in a line of the name of a panel, and the height of a line [inches]
 PLOT, BAR, HEADER = 2.5, 0.6, 0.75  # heights of a chart, of a color bar below shapes, and the title [inches]
 SHARE, STACKED = (
@@ -35,6 +35,7 @@ SHARE, STACKED = (
 )  # width of shapes left of a chart over the width of the picture, and aspect above which the chart is below
 NARROWEST_AND_WIDEST = (0.5, 3.5)  # width over height of shapes
 RULER = 0.5  # height of the strip for scale bar and triad [inches]
+CENTERED = 1.15  # gain in scale from which panels are centered each on its shape
 ARROW = 0.15  # length of the longest arrow over the size
 TICKS = (0.05, 0.16)  # least distance of ticks over the range, upright and level
 ARROWS = {2: 9, 3: 4}  # of a field along the longest side of a picture, by its dimension
@@ -189,11 +190,17 @@ def rods_picture(
 
 
 def _views(contents: list[np.ndarray], radius: float, angles, charted: bool) -> list[View]:
-    """Return a view of each content, points (n, 3) with a radius [m], of one scale, with a strip for the ruler."""
+    """Return a view of each content, points (n, 3) with a radius [m], of one scale, with a strip for the ruler.
+
+    Views are the same, unless views each centered on its content are much larger.
+    """
     room = WIDTH * (SHARE if charted else 1.0) / len(contents)
     bounds = (max(NARROWEST_AND_WIDEST[0], min(1.0, room / TALLEST)), NARROWEST_AND_WIDEST[1])
     views = [View.fitted(points, directions(*angles), bounds, radius) for points in contents]
     half = 0.5 * np.max([view.size for view in views], axis=0)
+    whole = View.fitted(np.concatenate(contents), directions(*angles), bounds, radius)
+    if whole.size[0] < CENTERED * 2.0 * half[0]:
+        views, half = [whole] * len(views), 0.5 * whole.size
     centers = [0.5 * (view.low + view.high) for view in views]
     strip = [0.0, RULER / room * 2.0 * half[0]]
     return [

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from importlib.util import find_spec
 from types import SimpleNamespace
 
 import numpy as np
@@ -31,8 +30,12 @@ class MissingRendererError(DataError, ImportError):
 
 
 def available() -> bool:
-    """Return True if pyvista is installed."""
-    return find_spec("pyvista") is not None
+    """Return True if pyvista is installed and its libraries are found."""
+    try:
+        pyvista_module()
+    except ImportError:
+        return False
+    return True
 
 
 @cache
