@@ -148,10 +148,12 @@ def parser(arguments: list[str]) -> Parser:
     if arguments[:1] == ["bench"] and len(arguments) > 1 and not arguments[1].startswith("-"):
         add_parameters(bench.add_argument_group(f"parameters of {arguments[1]}"), load_scene(arguments[1]))
 
-    export = commands.add_parser("export", help="write a recorded run as USD")
+    export = commands.add_parser("export", help="write a recorded run as USD, as a movie, or for the viewer rerun")
     export.set_defaults(command=export_run)
     export.add_argument("directory", type=Path, metavar="DIR", help="directory of a run")
-    export.add_argument("--to", type=Path, metavar="FILE", help="a .usdc or .usda file (default: DIR/export.usdc)")
+    export.add_argument(
+        "--to", type=Path, metavar="FILE", help="a .usdc, .usda, .mp4 or .rrd file (default: DIR/export.usdc)"
+    )
     export.add_argument("--tube", action="store_true", help="write tube meshes, not curves")
     export.add_argument(
         "--revolve", type=int, default=0, metavar="N", help="convert meridians to surfaces of revolution of N sides"
@@ -374,15 +376,15 @@ def bench_scene(chosen: argparse.Namespace) -> int:
 
 
 def export_run(chosen: argparse.Namespace) -> int:
-    """Write trajectory.h5 as USD."""
+    """Write trajectory.h5 as USD, as a movie, or for rerun."""
     from ddg_warp.run.recorder import export_usd
 
     source = chosen.directory / "trajectory.h5"
     if not source.is_file():
         raise InputError(f"there is no run in {chosen.directory}: {source} is missing")
     target = chosen.to or chosen.directory / "export.usdc"
-    if target.suffix not in (".usda", ".usdc"):
-        raise InputError(f"--to {target}: the file must end in .usdc or .usda")
+    if target.suffix not in (".usda", ".usdc", ".mp4", ".rrd"):
+        raise InputError(f"--to {target}: the file must end in .usdc, .usda, .mp4 or .rrd")
     if chosen.revolve and chosen.revolve < 3:
         raise InputError(f"--revolve {chosen.revolve}: a surface of revolution has 3 sides at least")
     try:
@@ -390,7 +392,16 @@ def export_run(chosen: argparse.Namespace) -> int:
     except OSError as error:
         raise system_error(target, error) from error
     with refused():
-        export_usd(source, target, tube=chosen.tube, revolve=chosen.revolve)
+        if target.suffix == ".mp4":
+            from ddg_warp.run.movie import movie
+
+            movie(source, target, title=chosen.directory.name)
+        elif target.suffix == ".rrd":
+            from ddg_warp.run.rerun_export import export_rerun
+
+            export_rerun(source, target)
+        else:
+            export_usd(source, target, tube=chosen.tube, revolve=chosen.revolve)
     print(f"wrote {target}")
     return DONE
 

@@ -30,7 +30,7 @@ class MissingRendererError(DataError, ImportError):
 
 
 def available() -> bool:
-    """Return True if pyvista is installed and its libraries are found."""
+    """Return True if pyvista can be imported."""
     try:
         pyvista_module()
     except ImportError:

@@ -759,8 +759,14 @@ refuse(
         "steps without end": (lambda: command(*FALL, "--dt", "1e-300"), "take longer steps"),
         "export below a file": (lambda: fail_command("export DIR/out --to DIR/file/a.usda"), "file/a.usda"),
         "export to the system": (lambda: fail_command("export DIR/out --to /proc/x.usda"), "/proc/x.usda: "),
-        "export to a directory": (lambda: fail_command("export DIR/out --to DIR"), "must end in .usdc or .usda"),
-        "export as text": (lambda: fail_command("export DIR/out --to DIR/a.txt"), "must end in .usdc or .usda"),
+        "export to a directory": (
+            lambda: fail_command("export DIR/out --to DIR"),
+            "must end in .usdc, .usda, .mp4 or .rrd",
+        ),
+        "export as text": (
+            lambda: fail_command("export DIR/out --to DIR/a.txt"),
+            "must end in .usdc, .usda, .mp4 or .rrd",
+        ),
         "two sides": (lambda: fail_command("export DIR/out --revolve 2"), "3 sides at least"),
     },
 )
