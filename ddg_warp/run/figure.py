@@ -29,10 +29,8 @@ WIDTH, TALLEST = 7.0, 6.0  # of a picture and of its shapes [inches]
 LETTERS = 34  # of the labels of a legend with two columns at most
 NAME, LINE = 26, 0.17  # letters in a line of the name of a panel, and the height of a line [inches]
 PLOT, BAR, HEADER = 2.5, 0.6, 0.75  # heights of a chart, of a color bar below shapes, and the title [inches]
-SHARE, STACKED = (
-    0.58,
-    1.9,
-)  # width of shapes left of a chart over the width of the picture, and aspect above which the chart is below
+SHARE = 0.58  # width of shapes left of a chart over the width of the picture
+STACKED = 1.9  # width over height of shapes above which a chart is below
 NARROWEST_AND_WIDEST = (0.5, 3.5)  # width over height of shapes
 RULER = 0.5  # height of the strip for scale bar and triad [inches]
 CENTERED = 1.15  # gain in scale from which panels are centered each on its shape
@@ -114,13 +112,7 @@ def rods_picture(
     size = float(np.max(high - low))
     flat = np.flatnonzero(high - low <= FLAT * size)
     axes = [k for k in range(3) if k != (flat[0] if len(flat) else None)]
-    arrows = {}
-    if loads is not None and len(loads[0]):
-        pushed = np.isin(loads[0], shapes.rows, invert=True)[:, None]  # arrows onto surfaces end there
-        vectors = ARROW * size / np.linalg.norm(loads[1], axis=1).max() * loads[1]
-        arrows[LOAD] = np.stack([-vectors * pushed, vectors * ~pushed], 1) + points[-1][loads[0], None]
-    if contacts is not None and (largest := largest_force(contacts)):
-        arrows[CONTACT] = contact_arrows(contacts, ARROW * size / largest)
+    arrows = _force_arrows(points[-1], shapes, ARROW * size, loads, contacts)
     norm = Normalize(times.min(), times.max() if np.ptp(times) > 0.0 else times[0] + 1.0)
     if values is not None:
         norm = Normalize(np.nanmin(values), np.nanmax(values))
@@ -176,17 +168,30 @@ def rods_picture(
         _draw_lines(figure.add_subplot(chart_cell), **{"title": "", "log": False, **chart})
     elif chart is not None:
         _draw_path(figure.add_subplot(chart_cell), chart, unit)
-    notes = [note] if note else []
-    if fixed is not None and len(fixed):
-        notes.append("dark dots: fixed nodes")
-    if LOAD in arrows:
-        notes.append("green arrows: applied forces")
-    if CONTACT in arrows:
-        notes.append(f"red arrows: contact forces of pairs, largest {largest:.3g} N")
-    if notes:
-        figure.supxlabel("; ".join(notes), fontsize=8, color=GREY, x=0.03, ha="left")
+    notes = {
+        note: bool(note),
+        "dark dots: fixed nodes": fixed is not None and len(fixed),
+        "green arrows: applied forces": LOAD in arrows,
+        f"red arrows: contact forces of pairs, largest {largest_force(contacts):.3g} N": CONTACT in arrows,
+    }
+    if any(notes.values()):
+        text = "; ".join(text for text, applies in notes.items() if applies)
+        figure.supxlabel(text, fontsize=8, color=GREY, x=0.03, ha="left")
     figure.suptitle(textwrap.fill(title, round(TITLE * figure.get_figwidth())), x=0.03, ha="left", fontsize=11)
     _save(figure, path)
+
+
+def _force_arrows(points: np.ndarray, shapes: Shapes, longest: float, loads, contacts) -> dict[tuple, np.ndarray]:
+    """Return arrows (n, 2, 3) of applied and of contact forces by color, the largest as long as `longest` [m]."""
+    arrows = {}
+    if loads is not None and len(loads[0]):
+        rows, forces = loads
+        pushed = np.isin(rows, shapes.rows, invert=True)[:, None]  # arrows onto surfaces end there
+        vectors = longest / np.linalg.norm(forces, axis=1).max() * forces
+        arrows[LOAD] = np.stack([-vectors * pushed, vectors * ~pushed], 1) + points[rows, None]
+    if largest := largest_force(contacts):
+        arrows[CONTACT] = contact_arrows(contacts, longest / largest)
+    return arrows
 
 
 def _views(contents: list[np.ndarray], radius: float, angles, charted: bool) -> list[View]:
