@@ -8,6 +8,8 @@ import pytest
 import ddg_warp as ddg
 from ddg_warp.model.rebuild import ModelBuilder
 from ddg_warp.solve.equilibrium import statics
+
+pytest.importorskip("torch")
 from ddg_warp.torch.gradient_check_scenes import OBJECTS, scene_of
 
 WORLDS, DT = 2, 2e-3

@@ -4,7 +4,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 import warp as wp
 
 import ddg_warp as ddg
@@ -14,12 +13,14 @@ from ddg_warp.geometry import meshes
 from ddg_warp.solve.equilibrium.coupled_tangent import CoupledTangent
 from ddg_warp.solve.linear.exact_system import ExactSystem
 from ddg_warp.solve.linear.pcg import PCG
-from ddg_warp.torch import Simulator
-from tests.adjoint import differences
-from tests.adjoint.differences import TIGHT, built, cotangent, directions, entries, moving_state
-from tests.adjoint.test_adjoint import DT, SCENES, SOFT
-from tests.pairwise import chosen, covering
-from tests.torch.test_torch import STIFFNESS
+
+torch = pytest.importorskip("torch")
+from ddg_warp.torch import Simulator  # noqa: E402
+from tests.adjoint import differences  # noqa: E402
+from tests.adjoint.differences import TIGHT, built, cotangent, directions, entries, moving_state  # noqa: E402
+from tests.adjoint.test_adjoint import DT, SCENES, SOFT  # noqa: E402
+from tests.pairwise import chosen, covering  # noqa: E402
+from tests.torch.test_torch import STIFFNESS  # noqa: E402
 
 RATE = 1.0 / DT
 

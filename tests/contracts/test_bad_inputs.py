@@ -10,6 +10,7 @@ from bad_inputs import CASES, NAN, RING, RUBBER, STIFFNESS, built, counts, dome,
 import ddg_warp as ddg
 from ddg_warp.errors import SolverError
 
+pytest.importorskip("torch")
 COUNTS = counts()  # imports the modules of all cases
 
 

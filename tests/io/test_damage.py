@@ -43,7 +43,8 @@ SIZES = (0, 1000, 20_000, 40_000, 80_000, 150_000, 250_000, 400_000)
 def run_in_process(code: str, *arguments) -> subprocess.CompletedProcess:
     """Run code in a separate process, so that crashes, also at exit, are seen."""
     root = Path(__file__).resolve().parents[2]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), str(Path(__file__).parent)])}
+    path = os.pathsep.join([str(root), str(Path(__file__).parent)])
+    environment = os.environ | {"PYTHONPATH": path, "PYTHONWARNINGS": "ignore::FutureWarning"}  # Warp on Python 3.10
     return subprocess.run(
         [sys.executable, "-c", code, *map(str, arguments)], env=environment, capture_output=True, text=True, check=False
     )

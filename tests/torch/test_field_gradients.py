@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-import torch
 
 import ddg_warp as ddg
 from ddg_warp.errors import SceneError
-from ddg_warp.torch import Simulator
+
+torch = pytest.importorskip("torch")
+from ddg_warp.torch import Simulator  # noqa: E402
 
 NODES, LENGTH, DT, STEPS, WORLDS = 9, 0.3, 0.01, 6, 2
 SOFT = ddg.Material(young=1e6, density=1000.0, poisson=0.5)

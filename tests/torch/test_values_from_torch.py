@@ -11,11 +11,11 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.errors import GradientWarning, SceneError
-from ddg_warp.torch.gradient_check_scenes import scene_of
 from tests.adjoint import differences
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import Simulator, WorldState  # noqa: E402
+from ddg_warp.torch.gradient_check_scenes import scene_of  # noqa: E402
 from tests.pairwise import covering  # noqa: E402
 
 REAL = torch.float64
