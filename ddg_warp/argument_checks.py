@@ -76,6 +76,11 @@ def shown(value) -> str:
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
+def number_of(count: int, noun: str) -> str:
+    """Return a count with its noun, such as "1 world" or "2 worlds"."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def _is_number(value) -> bool:
     return hasattr(value, "__float__") and not isinstance(value, str | bytes | bool | np.bool_ | complex)
 

@@ -12,12 +12,26 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import host_arrays
+from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core.launch import THREADS
 
 # Threads of a grid-stride loop, as many as a large GPU runs at once.
 #
 # Measured: with 2^20, products of pairs took a fifth longer on an H200.
 MOST = 2**18
+
+
+def device_named(name):
+    """Return a Warp device by name; by default CUDA if there is one.
+
+    Raises:
+        SceneError: there is no such device.
+    """
+    try:
+        return wp.get_device(("cuda:0" if wp.is_cuda_available() else "cpu") if name is None else name)
+    except (ValueError, RuntimeError, TypeError, AttributeError):
+        devices = ", ".join(device.alias for device in wp.get_devices())
+        raise SceneError(f"device is {name!r}; there is {devices}") from None
 
 
 def allocate(shape: tuple[int, ...], dtype, device) -> wp.array:

@@ -25,9 +25,36 @@ def cable(device, analysis=None):
 
 def test_load_parameters_are_no_seconds(device):
     model = cable(device)
-    assert repr(model.state()).startswith("<State at t = 0 s: 1 worlds of 5 points")
-    assert repr(statics.solve(model)).startswith("<State at load parameter 1: 1 worlds of 5 points")
+    assert repr(model.state()).startswith("<State at t = 0 s: 1 world of 5 points")
+    assert repr(statics.solve(model)).startswith("<State at load parameter 1: 1 world of 5 points")
     assert repr(cable(device, ddg.Statics()).state()).startswith("<State at load parameter 0:")
+
+
+def test_objects_show_themselves_in_a_line(device):
+    model = cable(device)
+    assert repr(model) == f"<Model of 1 rod: 1 world of 5 points on {model.device} in {model.precision}>"
+    integrator = ddg.Integrator(model, "implicit_midpoint")
+    assert repr(integrator) == f"<Integrator by implicit_midpoint, solver newton, of {model!r}>"
+    result = ddg.simulate(model.scene, device=device, duration=0.02, progress=False)
+    assert repr(result).startswith(f"<Result: 3 states on {model.device}, times 0 to 0.02, ")
+
+
+def test_models_and_states_move_to_devices(device):
+    """A state stays with its model, and says how to copy both; parameters go along."""
+    model = cable(device)
+    state = ddg.Integrator(model).step(model.state(), 0.01)
+    assert model.to(device) is model
+    assert state.to(device) is state
+    with pytest.raises(ddg.SceneError, match="device is 'abacus'; there is"):
+        model.to("abacus")
+    with pytest.raises(ddg.SceneError, match="device is 'abacus'; there is"):
+        state.to("abacus")
+    other = model.to("cpu")
+    copy = other.restore(state.snapshot())
+    np.testing.assert_array_equal(copy.points(), state.points())
+    if other is not model:
+        with pytest.raises(ddg.SceneError, match=r"a state lives with its model, .*restore"):
+            state.to("cpu")
 
 
 def test_report_lists_absent_terms_on_request_only(device):

@@ -60,7 +60,7 @@ class Model:
         self, scene, *, device=None, precision: str | None = None, worlds: int = 1, allow_rounding: bool = False
     ):
         self.scene = scene
-        self.wp_device = _device(device)
+        self.wp_device = device_arrays.device_named(device)
         asked = getattr(scene.analysis, "precision", None) if precision is None else precision
         self.types = choose(asked, self.wp_device)
         self.worlds, self.allow_rounding = worlds, allow_rounding
@@ -94,16 +94,11 @@ class Model:
         return CoupledModel(coupled, self.worlds, self.wp_device, self.types.real, motions, user_forces)
 
     def __repr__(self) -> str:
-        scene, coupled = self.scene, self.coupled
-        lines = [f"<Model on {self.device} in {self.precision}, {self.worlds} worlds of {self.points_count} points:"]
-        if self.groups:
-            lines.append(f"{sum(group.rods for group in self.groups)} rods of their own in {len(self.groups)} groups,")
-        if coupled:
-            rods, shells, turned = len(coupled.host.rods), len(coupled.host.shells), len(scene.axisymmetric_shells)
-            lines.append(
-                f"a coupled system of {rods} rods, {shells} shells, {turned} shells of revolution ({coupled.host.blocks} blocks);"
-            )
-        return "\n ".join([*lines, "see model.report()>"])
+        scene, number = self.scene, argument_checks.number_of
+        parts = {"rod": scene.rod_count, "shell": len(scene.shells), "meridian": len(scene.axisymmetric_shells)}
+        counts = ", ".join(number(count, name) for name, count in parts.items() if count)
+        size = f"{number(self.worlds, 'world')} of {number(self.points_count, 'point')}"
+        return f"<Model of {counts}: {size} on {self.device} in {self.precision}>"
 
     def __reduce__(self):
         """Have pickle, torch.save and copy.deepcopy rebuild the scene with the current parameters and rest shapes."""
@@ -113,6 +108,15 @@ class Model:
     def device(self) -> str:
         """Name of the Warp device."""
         return str(self.wp_device)
+
+    def to(self, device) -> "Model":
+        """Return the model on a device: itself, or one built there with its current parameters and rest shapes.
+
+        Raises:
+            SceneError: there is no such device.
+        """
+        there = device_arrays.device_named(str(device))
+        return self if there == self.wp_device else ModelBuilder(self, self.worlds, str(there)).build()
 
     @property
     def precision(self) -> str:
@@ -523,15 +527,6 @@ class Model:
             [device_arrays.columns(out), device_arrays.columns(out if stress is None else stress)],
             device=self.wp_device,
         )
-
-
-def _device(name):
-    """Return a Warp device by name; by default CUDA if there is one."""
-    try:
-        return wp.get_device(("cuda:0" if wp.is_cuda_available() else "cpu") if name is None else name)
-    except (ValueError, RuntimeError, TypeError, AttributeError):
-        devices = ", ".join(device.alias for device in wp.get_devices())
-        raise SceneError(f"device is {name!r}; there is {devices}") from None
 
 
 def needs_coupling(scene) -> bool:

@@ -6,16 +6,16 @@ from ddg_warp.errors import SceneError
 
 
 class ModelBuilder:
-    """Scene, options, parameters and rest shapes of a model, for rebuilding it with `worlds` worlds.
+    """Scene, options, parameters and rest shapes of a model, for rebuilding it with `worlds` worlds on a device, by default its own.
 
     Raises:
         SceneError: a parameter differs between the model's worlds, and `worlds` is another number.
     """
 
-    def __init__(self, model, worlds: int):
+    def __init__(self, model, worlds: int, device: str | None = None):
         self.scene = model.scene
         self.options = {
-            "device": model.device,
+            "device": device or model.device,
             "precision": model.precision,
             "worlds": worlds,
             "allow_rounding": model.allow_rounding,

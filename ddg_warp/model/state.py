@@ -152,7 +152,22 @@ class State:
         model = self.model
         static = self.outcome is not None or not isinstance(model.scene.analysis, Dynamics)
         reached = f"load parameter {self.time:g}" if static else f"t = {self.time:g} s"
-        return f"<State at {reached}: {model.worlds} worlds of {model.points_count} points on {model.device}>"
+        number = argument_checks.number_of
+        size = f"{number(model.worlds, 'world')} of {number(model.points_count, 'point')}"
+        return f"<State at {reached}: {size} on {model.device}>"
+
+    def to(self, device) -> "State":
+        """Return the state if its model is on that device.
+
+        Raises:
+            SceneError: the model is on another device; the message has the calls that copy the state.
+        """
+        if arrays.device_named(str(device)) != self.model.wp_device:
+            raise SceneError(
+                f"a state lives with its model, on {self.model.device}; copy both: model = state.model.to({str(device)!r}), "
+                "state = model.restore(state.snapshot())"
+            )
+        return self
 
     def parts(self) -> dict:
         """Return the states of rod groups, the coupled system and grips, by name."""

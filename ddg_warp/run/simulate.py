@@ -83,7 +83,8 @@ class Result:
         reached = f"{self.times[0]:g} to {self.times[-1]:g}" if len(self.times) else "none"
         names = ", ".join(self.series) or "nothing"
         ended = f"; failed: {self.failure}" if self.failure else ""
-        return f"<Result: {len(self.times)} states, times {reached}, observed {names}, {self.wall_time:.3g} s of wall time{ended}>"
+        size = f"{argument_checks.number_of(len(self.times), 'state')} on {self.model.device}"
+        return f"<Result: {size}, times {reached}, observed {names}, {self.wall_time:.3g} s of wall time{ended}>"
 
     def _repr_html_(self) -> str | None:
         """Return a page of the last state for notebooks; None without viser or a state."""

@@ -23,7 +23,7 @@ from ddg_warp.torch.controls import FIELD
 from ddg_warp.torch.engine import LOAD, Engine
 from ddg_warp.torch.rollout import Plan, bytes_of, plan, roll
 from ddg_warp.torch.state_layout import copies, tensors
-from ddg_warp.torch.world_state import WorldState, outcome_names
+from ddg_warp.torch.world_state import WorldState, outcome_names, require_same
 from ddg_warp.torch.wrenches import Wrenches, WrenchTensors
 
 SETTLED = {"failures", "check_every", "energy_bound"}  # arguments of `Integrator` that the engine sets
@@ -86,6 +86,24 @@ class Simulator(torch.nn.Module):
                 engine = self._engines[worlds]
         engine.follow(self.model)
         return engine
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the tensors of states."""
+        return torch.device(str(wp.device_to_torch(self.model.wp_device)))
+
+    def to(self, *arguments, **options) -> "Simulator":
+        """Return the simulator if its model has that device and dtype; arguments are those of `torch.nn.Module.to`.
+
+        Raises:
+            SceneError: the model is on another device, or of another dtype.
+        """
+        require_same("a simulator", self.model, arguments, options, "leave this one where it is")
+        return self
+
+    def extra_repr(self) -> str:
+        """Return scheme, time step and model."""
+        return f"{self.scheme}, dt = {self.dt:g} s, {self.model!r}"
 
     def __getstate__(self):
         return {name: value for name, value in self.__dict__.items() if name != "_lock"} | {

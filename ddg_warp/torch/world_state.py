@@ -4,14 +4,16 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
+import warp as wp
 
+from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core import outcome
 from ddg_warp.torch.engine import Engine
 from ddg_warp.torch.state_layout import StateLayout
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class WorldState:
     """State of B worlds as tensors in storage layout; properties such as `positions` are in user order.
 
@@ -85,6 +87,22 @@ class WorldState:
         values = tuple(value.detach() for value in self.values)
         return replace(self, values=values, differentiable=torch.ones_like(self.differentiable))
 
+    def __repr__(self) -> str:
+        number = argument_checks.number_of
+        if self.engine is None:
+            return f"<WorldState at t = {self.time:g} s: {number(len(self.codes), 'world')}, of no simulator yet>"
+        size = f"{number(len(self.codes), 'world')} of {number(self.engine.model.points_count, 'point')}"
+        return f"<WorldState at t = {self.time:g} s: {size} on {self.engine.device}>"
+
+    def to(self, *arguments, **options) -> "WorldState":
+        """Return the state if it has that device and dtype; arguments are those of `torch.Tensor.to`.
+
+        Raises:
+            SceneError: it is on another device, or of another dtype.
+        """
+        require_same("a state", self.layout.model, arguments, options, "give it to simulator.world_state(state) there")
+        return self
+
     def __getstate__(self):
         return {attribute.name: getattr(self, attribute.name) for attribute in fields(self)} | {"engine": None}
 
@@ -97,6 +115,21 @@ torch.utils._pytree.register_pytree_node(
     lambda state: ([*state.values, state.codes, state.differentiable], (state.time, state.engine)),
     lambda values, context: WorldState(tuple(values[:-2]), *context, *values[-2:]),
 )
+
+
+def require_same(name: str, model, arguments: tuple, options: dict, remedy: str) -> None:
+    """Refuse arguments of `torch.Tensor.to` with another device or dtype than those of a model."""
+    device, dtype, *_ = torch._C._nn._parse_to(*arguments, **options)
+    own = torch.device(str(wp.device_to_torch(model.wp_device)))
+    if device is not None and (device.type, device.index or 0) != (own.type, own.index or 0):
+        raise SceneError(
+            f"{name} lives on {own}, as its model: make another by Simulator(model.to({str(device)!r}), dt), and {remedy}"
+        )
+    real = wp.dtype_to_torch(model.types.real)
+    if dtype not in (None, real):
+        raise SceneError(
+            f"{name} is of {real} in the precision {model.precision!r}; convert tensors, such as state.positions.to({dtype})"
+        )
 
 
 def outcome_names(codes: torch.Tensor) -> np.ndarray:

@@ -349,7 +349,7 @@ def test_repr_names_object_and_counts(device):
     state = model.state()
     texts = [
         (scene, "Scene", "3 rods of 27 nodes", "1 joints", "1 supports, 1 loads"),
-        (model, "Model", "float64", "2 worlds of 27 points", "1 rods of their own", "coupled system of 2 rods"),
+        (model, "Model", "float64", "2 worlds of 27 points", "of 3 rods:"),
         (state, "State", "t = 0 s", "2 worlds of 27 points"),
         (Result(scene, model, state, [0.0, 0.5], {"tip": [0.0, 1.0]}), "Result", "2 states", "0 to 0.5", "tip"),
     ]

@@ -149,6 +149,9 @@ class Integrator:
         self._spinning = False  # True if the current step has gyroscopic couples
         self._doubted = False  # True once the rounding warning is issued
 
+    def __repr__(self) -> str:
+        return f"<Integrator by {self.scheme}, solver {self.solver}, of {self.model!r}>"
+
     @timers.root("step")
     def step(self, state: State, dt: float, controls: Controls | None = None) -> State:
         """Return the state after a step of dt [s]. States that the caller keeps stay unchanged: see `State`.
