@@ -77,7 +77,7 @@ def shown(value) -> str:
 
 
 def number_of(count: int, noun: str) -> str:
-    """Return a count with its noun, such as "1 world" or "2 worlds"."""
+    """Return a count with the noun, such as "1 world" or "2 worlds"."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 

@@ -40,7 +40,7 @@ def test_objects_show_themselves_in_a_line(device):
 
 
 def test_models_and_states_move_to_devices(device):
-    """A state stays with its model, and says how to copy both; parameters go along."""
+    """States stay with models, and say how to copy both."""
     model = cable(device)
     state = ddg.Integrator(model).step(model.state(), 0.01)
     assert model.to(device) is model
@@ -49,10 +49,10 @@ def test_models_and_states_move_to_devices(device):
         model.to("abacus")
     with pytest.raises(ddg.SceneError, match="device is 'abacus'; there is"):
         state.to("abacus")
-    other = model.to("cpu")
-    copy = other.restore(state.snapshot())
+    target = model.to("cpu")
+    copy = target.restore(state.snapshot())
     np.testing.assert_array_equal(copy.points(), state.points())
-    if other is not model:
+    if target is not model:
         with pytest.raises(ddg.SceneError, match=r"a state lives with its model, .*restore"):
             state.to("cpu")
 

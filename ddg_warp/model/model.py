@@ -115,8 +115,8 @@ class Model:
         Raises:
             SceneError: there is no such device.
         """
-        there = device_arrays.device_named(str(device))
-        return self if there == self.wp_device else ModelBuilder(self, self.worlds, str(there)).build()
+        target = device_arrays.device_named(str(device))
+        return self if target == self.wp_device else ModelBuilder(self, self.worlds, str(target)).build()
 
     @property
     def precision(self) -> str:

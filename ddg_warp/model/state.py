@@ -157,10 +157,10 @@ class State:
         return f"<State at {reached}: {size} on {model.device}>"
 
     def to(self, device) -> "State":
-        """Return the state if its model is on that device.
+        """Return the state itself, on the device of the model.
 
         Raises:
-            SceneError: the model is on another device; the message has the calls that copy the state.
+            SceneError: another device is given; the message has the calls that copy the state.
         """
         if arrays.device_named(str(device)) != self.model.wp_device:
             raise SceneError(

@@ -93,10 +93,10 @@ class Simulator(torch.nn.Module):
         return torch.device(str(wp.device_to_torch(self.model.wp_device)))
 
     def to(self, *arguments, **options) -> "Simulator":
-        """Return the simulator if its model has that device and dtype; arguments are those of `torch.nn.Module.to`.
+        """Return the simulator itself, on the device and with the dtype of the model; see `torch.nn.Module.to`.
 
         Raises:
-            SceneError: the model is on another device, or of another dtype.
+            SceneError: another device or dtype is given; the message has the calls that build there.
         """
         require_same("a simulator", self.model, arguments, options, "leave this one where it is")
         return self

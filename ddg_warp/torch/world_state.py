@@ -95,10 +95,10 @@ class WorldState:
         return f"<WorldState at t = {self.time:g} s: {size} on {self.engine.device}>"
 
     def to(self, *arguments, **options) -> "WorldState":
-        """Return the state if it has that device and dtype; arguments are those of `torch.Tensor.to`.
+        """Return the state itself, on the device and with the dtype of the model; see `torch.Tensor.to`.
 
         Raises:
-            SceneError: it is on another device, or of another dtype.
+            SceneError: another device or dtype is given; the message has the calls that copy the state.
         """
         require_same("a state", self.layout.model, arguments, options, "give it to simulator.world_state(state) there")
         return self
@@ -118,12 +118,12 @@ torch.utils._pytree.register_pytree_node(
 
 
 def require_same(name: str, model, arguments: tuple, options: dict, remedy: str) -> None:
-    """Refuse arguments of `torch.Tensor.to` with another device or dtype than those of a model."""
+    """Refuse arguments of `torch.Tensor.to` with another device or dtype than a model has."""
     device, dtype, *_ = torch._C._nn._parse_to(*arguments, **options)
-    own = torch.device(str(wp.device_to_torch(model.wp_device)))
-    if device is not None and (device.type, device.index or 0) != (own.type, own.index or 0):
+    current = torch.device(str(wp.device_to_torch(model.wp_device)))
+    if device is not None and (device.type, device.index or 0) != (current.type, current.index or 0):
         raise SceneError(
-            f"{name} lives on {own}, as its model: make another by Simulator(model.to({str(device)!r}), dt), and {remedy}"
+            f"{name} lives on {current}, as its model: make another by Simulator(model.to({str(device)!r}), dt), and {remedy}"
         )
     real = wp.dtype_to_torch(model.types.real)
     if dtype not in (None, real):

@@ -50,8 +50,8 @@ def test_to_elsewhere_says_how(simulator):
 def test_a_state_moves_by_world_state(simulator):
     """The next step of the copy equals that of the original."""
     state = simulator.step(simulator.initial_state(2))
-    other = Simulator(simulator.model.to("cpu"), dt=0.01)
-    moved = other.step(other.world_state(state)).positions
+    target = Simulator(simulator.model.to("cpu"), dt=0.01)
+    moved = target.step(target.world_state(state)).positions
     assert moved.device.type == "cpu"
     torch.testing.assert_close(moved, simulator.step(state).positions.cpu(), rtol=1e-9, atol=1e-9)
 
