@@ -55,7 +55,7 @@ class GripRates:
         return [(self.grip, *entry) for entry in along + around]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class EpisodeState:
     """State of the episodes of B worlds, the argument of observations, rewards and terminations.
 
@@ -77,6 +77,9 @@ class EpisodeState:
     steps: torch.Tensor
     outcomes: np.ndarray
     wrenches: WrenchTensors | None = None
+
+    def __repr__(self) -> str:
+        return f"<EpisodeState after {self.steps.min()} to {self.steps.max()} steps, of {self.world!r}>"
 
     @property
     def failed(self) -> torch.Tensor:
@@ -172,6 +175,11 @@ class Environment:
         self._start = simulator.initial_state(self.worlds) if start is None else start
         first = self.begin(self.generators(0))
         self.observations, self.observation_dtype = self.observe(first).shape[1], self.observe(first).dtype
+
+    def __repr__(self) -> str:
+        names = ", ".join(self.names)
+        worlds = argument_checks.number_of(self.worlds, "world")
+        return f"<Environment of {worlds}, episodes of {self.steps} steps, actions {names}, on {self.device}>"
 
     def generators(self, seed: int) -> list[np.random.Generator]:
         """Return a random generator for each world, of independent streams.

@@ -95,6 +95,13 @@ def test_actions_are_velocities_of_grips():
     np.testing.assert_allclose(grip_node, moved, atol=1e-14)
 
 
+def test_text_is_one_line():
+    env = environment(gripped())
+    episodes = env.step(env.begin(env.generators(0)), some_actions(1)[0])
+    assert repr(env).startswith("<Environment of 3 worlds, episodes of 4 steps, actions grip 0: velocity x [m/s], ")
+    assert repr(episodes) == f"<EpisodeState after 1 to 1 steps, of {episodes.world!r}>"
+
+
 def test_worlds_reset_independently():
     """A reset world equals its second episode in a new simulator; the other worlds continue unchanged."""
     env, actions = environment(steps=9), some_actions(6)
