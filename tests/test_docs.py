@@ -23,7 +23,8 @@ FILES = {file: text for page in [*PAGES, *TUTORIALS] for file, text in BLOCK.fin
 LONG = ("strands", "bench")
 OPTIONAL = {
     "torch": "import torch",
-    "gymnasium": "gymnasium_env",
+    "gymnasium": "gymnasium",
+    "stable_baselines3": "stable_baselines3",
     "jax": "import jax",
     "pandas": "import pandas",
     "pyvista": "ddg.movie",

@@ -264,6 +264,7 @@ def test_a_killed_sweep_goes_on(tmp_path):
     script = KILLED.format(here=os.path.dirname(__file__), out=str(tmp_path / "killed"))
     process = subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.DEVNULL)
     while not (tmp_path / "killed" / "index.json").is_file() or not len(Episodes(tmp_path / "killed")):
+        assert process.poll() is None
         time.sleep(0.001)  # an index that takes long to write has less than there are files
     process.send_signal(signal.SIGKILL)
     process.wait()
