@@ -1,4 +1,5 @@
-"""The command line: `ddg-warp run | view | sweep | list | check | gradients | bench | export | warmup | info | docs`.
+"""The command line: `ddg-warp run | view | sweep | list | check | gradients | bench | export | warmup | info | docs |
+completion`.
 
 Exit codes: 0 done, 1 a check or the solver failed, 2 invalid input, 130 interrupted, 141 broken pipe.
 """
@@ -170,6 +171,15 @@ def parser(arguments: list[str]) -> Parser:
         "docs", help="open the documentation", description="Open the documentation that `tools/site` has built."
     )
     docs.set_defaults(command=open_docs)
+
+    completion = commands.add_parser("completion", help="print a script that completes words in a shell")
+    completion.set_defaults(command=complete)
+    completion.add_argument(
+        "shell", choices=("bash", "zsh", "fish"), help='for bash: eval "$(ddg-warp completion bash)"'
+    )
+    completion.add_argument(
+        "words", nargs=argparse.REMAINDER, help="print the completions of the last of these instead"
+    )
     return top
 
 
@@ -440,6 +450,14 @@ def open_docs(chosen: argparse.Namespace) -> int:
         raise InputError(f'there is no {page}; build it in a clone: pip install -e ".[docs]", then bash tools/site')
     print(page)
     webbrowser.open(page.as_uri())
+    return DONE
+
+
+def complete(chosen: argparse.Namespace) -> int:
+    """Print the completion script of a shell, or the completions of a command line."""
+    from ddg_warp.run.completion import SCRIPTS, completions
+
+    print("\n".join(completions(chosen.words)) if chosen.words else SCRIPTS[chosen.shell])
     return DONE
 
 
