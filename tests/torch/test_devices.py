@@ -1,6 +1,11 @@
 """Devices in torch: `.to` of simulators and states, their text, and networks in other precisions."""
 
 import copy
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -71,3 +76,20 @@ def test_networks_in_lower_precision_train(simulator, dtype):
         gradients[precision] = model.weight.grad.double()
     relative = (gradients[dtype] - gradients[torch.float64]).norm() / gradients[torch.float64].norm()
     assert relative < (1e-5 if dtype == torch.float32 else 1e-2)
+
+
+@pytest.mark.slow
+def test_two_processes_train_as_one(tmp_path):
+    """The file of the page on devices: two processes on the CPU end with the weights of one, to rounding."""
+    page = Path(__file__).parents[2] / "tools" / "docs" / "howto" / "devices.md"
+    (text,) = re.findall(r"^```python file=train.py\n(.*?)^```", page.read_text(), re.M | re.S)
+    (tmp_path / "train.py").write_text(text)
+    quiet = os.environ | {"CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
+    several = ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
+    sums = []
+    for options in ([], several):
+        command = [sys.executable, *options, "train.py"]
+        done = subprocess.run(command, cwd=tmp_path, env=quiet, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr[-2000:]
+        sums.append(float(re.search(r"sum of weights (\S+)", done.stdout)[1]))
+    assert sums[0] == pytest.approx(sums[1], rel=1e-12)
