@@ -67,17 +67,26 @@ def _fails(result):
     raise ValueError("no value")
 
 
-def test_to_pandas_has_a_row_a_state_or_names_the_remedy(device):
-    result = ddg.simulate(cable(), device=device, observe=observe, progress=False)
-    try:
-        import pandas  # noqa: F401
-    except ModuleNotFoundError:
-        with pytest.raises(ModuleNotFoundError, match="pip install pandas"):
-            result.to_pandas()
-        return
-    table = result.to_pandas()
-    assert table.index.name == "time"
-    np.testing.assert_array_equal(table["z"].to_numpy(), result.series["z"])
+def test_to_pandas_has_a_row_a_state(device):
+    """Columns equal the series; the index has the axis of the analysis."""
+    pytest.importorskip("pandas")
+    path = ddg.PathAnalysis(stop=ddg.StopCriterion(load=(-1.0, 1.0), steps=20), watch={"d": (0, 4)})
+    for analysis, axis in ((None, "time"), (ddg.Statics(load_steps=3), "load parameter"), (path, "arc length")):
+        scene = cable(analysis, clamped=True)
+        scene.add_force(0, 4, (0.0, 0.0, -1e-3))
+        result = ddg.simulate(scene, device=device, observe=observe, progress=False)
+        table = result.to_pandas()
+        assert table.index.name == axis
+        np.testing.assert_array_equal(table.index, result.times)
+        assert list(table.columns) == list(result.series)
+        for name, values in result.series.items():
+            np.testing.assert_array_equal(table[name], values)
+
+
+def test_to_pandas_names_the_remedy(device, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ModuleNotFoundError, match="pip install pandas"):
+        ddg.simulate(cable(), device=device, progress=False).to_pandas()
 
 
 def test_run_yields_the_states_of_step(device):

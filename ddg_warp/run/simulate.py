@@ -38,7 +38,7 @@ class Result:
         state: The last good state.
         times: Time of each recorded state [s] (states,), the initial one first. In statics the load parameter, along a path the arc
             length.
-        series: Observed values by name, arrays (states,), or (states, ...) of several numbers each.
+        series: Observed values by name, arrays (states,).
         statistics: `integrator.statistics()`, or the like of a static run.
         energies: Energies by term [J] at "start" and "end"; None at the start if `counted_from` is set.
         dt: Time step [s]; None in statics.
@@ -109,7 +109,7 @@ class Result:
         return summary(self.name, self.parameters, self, self.checks)
 
     def to_pandas(self):
-        """Return the series as a `pandas.DataFrame`, a row a recorded state; several numbers a state are columns "name.0", ...
+        """Return the series as a `pandas.DataFrame`, a row a recorded state.
 
         Its index is the time [s], in statics the load parameter, along a path the arc length.
 
@@ -122,13 +122,8 @@ class Result:
             raise ModuleNotFoundError(
                 "to_pandas needs pandas, which is not installed: `pip install pandas`; or take `result.series`, arrays by name"
             ) from None
-        columns = {}
-        for name, values in self.series.items():
-            flat = np.asarray(values).reshape(len(self.times), -1)
-            names = [name] if np.ndim(values) == 1 else [f"{name}.{i}" for i in range(flat.shape[1])]
-            columns |= dict(zip(names, flat.T, strict=True))
         axis = "arc length" if self.path is not None else "load parameter" if self.dt is None else "time"
-        return pd.DataFrame(columns, index=pd.Index(self.times, name=axis))
+        return pd.DataFrame(self.series, index=pd.Index(self.times, name=axis))
 
     def at(self, t: float, name: str) -> float:
         """Return the observed value `name` at time t [s], to a thousandth of a step.
