@@ -1,16 +1,24 @@
 """Shared fixtures: the device under test, and strict floating-point errors."""
 
-import importlib.util
 import sys
+from importlib.machinery import PathFinder
 
 import numpy as np
 import pytest
 
 from ddg_warp import device_arrays
 
-spec = importlib.util.find_spec("torch")
-if spec is None or spec.origin is None:  # folder `tests/torch` is a namespace package of that name
-    sys.modules["torch"] = None  # skips the tests of torch
+
+class PackageFinder(PathFinder):
+    """Finder of modules that does not take the folder `tests/torch` for torch where that is missing."""
+
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        spec = super().find_spec(name, path, target)
+        return None if name == "torch" and spec is not None and spec.origin is None else spec
+
+
+sys.meta_path[sys.meta_path.index(PathFinder)] = PackageFinder
 
 
 def pytest_addoption(parser):
