@@ -76,10 +76,12 @@ def swinging(model, sp: float, amplitude: float):
 
 def thrust(sp: float, amplitude: float) -> float:
     """Return the mean force of the fluid along x [N]."""
+    from scipy.integrate import trapezoid
+
     x = np.linspace(0.0, LENGTH, 2001)
     y, slope = (amplitude * LENGTH * shape(sp, x, order) for order in (0, 1))
     normal = resistance(sp)
-    return (normal - normal / RATIO) * float(np.trapezoid(0.5 * (1j * OMEGA * y * slope.conj()).real, x))
+    return (normal - normal / RATIO) * float(trapezoid(0.5 * (1j * OMEGA * y * slope.conj()).real, x))
 
 
 def observe(model, state) -> dict[str, float]:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.integrate import trapezoid
 
 import ddg_warp as ddg
 from ddg_warp.run.simulate import simulate
@@ -95,7 +96,7 @@ def test_power_of_drag_is_the_energy_loss(device, name, scheme):
     for _ in range(20):
         state = integrator.step(state, dt)
         power.append(model.drag(state).power)
-    change, taken = sum(model.energies(state).values()) - before, dt * np.trapezoid(power)
+    change, taken = sum(model.energies(state).values()) - before, dt * trapezoid(power)
     assert change < -0.02 * before
     if scheme == "implicit_midpoint":
         account = integrator.statistics()["energy"]

@@ -123,6 +123,7 @@ LEARNED = (
     "policy",
     "reach",
     "residual_network",
+    "sag_free_groom",
     "soft_gripper",
 )
 

@@ -104,7 +104,8 @@ def test_edge_force_decays_along_a_cylinder(device):
 def test_stiffness_of_a_sphere_under_point_loads(device):
     """F / w = 4 E h^2 / (R sqrt(3 (1 - nu^2))) (Reissner 1946) under opposite pole forces; edges are graded towards the poles.
 
-    At h = 1e-5 R rounding of membrane forces is 3 % of the load: supports do not balance the load, and the state is refused.
+    At h = 1e-5 R rounding of membrane forces is 3 % of the load: supports do not balance the load, and the state is refused. Here it
+    is 3e-4, a quarter of the last error, which varies with the version of SciPy.
     """
     R, h, load = 1.0, 1e-4, 1e-4
     stiffness = 4.0 * E * h**2 / (R * np.sqrt(3.0 * (1.0 - NU**2)))
@@ -117,7 +118,7 @@ def test_stiffness_of_a_sphere_under_point_loads(device):
         drop = R - equilibrium(scene, device)[1].points()[0, 2]
         errors.append(load * h / drop - 1.0)
     assert abs(errors[-1]) < 5e-3
-    assert order(edges, errors) == pytest.approx(2.0, abs=0.1)
+    assert order(edges, errors) == pytest.approx(2.0, abs=0.2)
 
 
 def hemisphere(n, R, grading=1):
