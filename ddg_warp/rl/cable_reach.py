@@ -1,8 +1,10 @@
 """Task of gymnasium "ddg_warp/CableReach-v0": a grip moves the free end of a hanging cable to a goal and keeps it there.
 
-import gymnasium, ddg_warp.rl
-env = gymnasium.make("ddg_warp/CableReach-v0", render_mode="rgb_array")
-envs = gymnasium.make_vec("ddg_warp/CableReach-v0", num_envs=16)
+    import gymnasium, ddg_warp.rl
+    env = gymnasium.make("ddg_warp/CableReach-v0", render_mode="rgb_array")
+    envs = gymnasium.make_vec("ddg_warp/CableReach-v0", num_envs=16)
+
+Copy this file for a task of your own.
 """
 
 import numpy as np

@@ -55,7 +55,7 @@ class Episodes:
         self._bound = np.inf if bound is None else argument_checks.positive("bound", bound)
         seconds = environment.simulator.dt * environment.substeps
         self.metadata = {**self.metadata, "render_fps": 1.0 / seconds}
-        self._generators = self._now = self._began = None
+        self._generators = self._now = self._start = None
 
     def spaces(self) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
         """Return the spaces of the actions and of the observations of one world."""
@@ -81,7 +81,8 @@ class Episodes:
         if seed is not None or self._generators is None:
             self._generators = self.environment.generators(self.np_random_seed)
         with torch.no_grad():
-            self._now = self._began = self.environment.begin(self._generators)
+            self._now = self.environment.begin(self._generators)
+            self._start = self._now.world.positions
             return self._observed()
 
     def advance(self, actions) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -100,7 +101,9 @@ class Episodes:
     def restart(self, ended: np.ndarray) -> np.ndarray:
         """Restart the worlds of a mask (B,) and return observations of all (B, n)."""
         with torch.no_grad():
-            self._now = self.environment.begin(self._generators, self._now, torch.as_tensor(ended))
+            mask = torch.as_tensor(ended, device=self.environment.device)
+            self._now = self.environment.begin(self._generators, self._now, mask)
+            self._start = torch.where(mask[:, None, None], self._now.world.positions, self._start)
             return self._observed()
 
     def image(self, world: int) -> np.ndarray:
@@ -116,7 +119,7 @@ class Episodes:
         if self._now is None:
             raise SceneError("render: no episode has begun; call reset first")
         markers = None if self._markers is None else numpy_of(self._markers(self._now)[world])
-        shapes = [numpy_of(state.world.positions[world]) for state in (self._began, self._now)]
+        shapes = (numpy_of(points[world]) for points in (self._start, self._now.world.positions))
         return picture(self.environment.model, *shapes, markers)
 
     def _observed(self) -> np.ndarray:

@@ -25,14 +25,13 @@ def picture(model, start: np.ndarray, points: np.ndarray, markers: np.ndarray | 
     surfaces = [(ball + centre, triangles) for centre in (() if markers is None else markers)]
     if model.obstacles is not None:
         surfaces.append(model.obstacles.surface(chosen=~model.obstacles.moved))
-    options, offset, parts = {}, 0, []
-    for nodes, cells in surfaces:
-        parts.append((nodes, cells + offset))
-        offset += len(nodes)
-    if offset:
-        nodes, cells = (np.concatenate(each) for each in zip(*parts, strict=True))
-        options["bodies"] = {1.0: (nodes, cells)}
+    offsets = np.cumsum([0, *(len(nodes) for nodes, _ in surfaces)])
+    bodies = None
+    if offsets[-1]:
+        nodes, cells = zip(*surfaces, strict=True)
+        cells = [each + offset for each, offset in zip(cells, offsets[:-1], strict=True)]
+        bodies = {1.0: (np.concatenate(nodes), np.concatenate(cells))}
     with TemporaryDirectory() as folder:
         path = Path(folder) / "picture.png"
-        rods_picture(model, [(0.0, start), (1.0, points)], path, names=["start", "now"], **options)
+        rods_picture(model, [(0.0, start), (1.0, points)], path, names=["start", "now"], bodies=bodies)
         return np.round(255.0 * imread(path)[..., :3]).astype(np.uint8)

@@ -1,7 +1,9 @@
 """Adapter of an `Environment` to Stable-Baselines3.
 
-envs = SB3Environment(environment)
-PPO("MlpPolicy", envs).learn(100_000)
+    envs = SB3Environment(environment)
+    PPO("MlpPolicy", envs).learn(100_000)
+
+Ended episodes restart in the same step.
 """
 
 import numpy as np

@@ -103,6 +103,45 @@ def test_pictures_show_goal_start_and_shape():
     assert [image.shape for image in envs.render()] == 2 * [before.shape]
 
 
+def test_pictures_show_obstacles_and_the_start_of_an_episode():
+    """A picture with a fixed obstacle; the start is that of the present episode."""
+    pytest.importorskip("matplotlib")
+    import ddg_warp as ddg
+    from ddg_warp.rl.environment import Environment, GripRates
+
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    rod = scene.add_rod(
+        np.linspace((0.0, 0.0, 0.1), (0.3, 0.0, 0.1), 5), section=ddg.Circle(4e-3), material=ddg.Material(1e6)
+    )
+    scene.clamp(rod, motion=ddg.Grip())
+    scene.contact()
+    scene.add_obstacle(ddg.Sphere((0.3, 0.0, 0.0), 0.05))
+    simulator = ddg.Simulator(scene.build("cpu", "float64"), 0.01)
+
+    def start(goals):
+        return simulator.initial_state(
+            positions=simulator.initial_state(2).positions + torch.nn.functional.pad(goals, (0, 2))[:, None]
+        )
+
+    task = Environment(
+        simulator,
+        2,
+        GripRates(axes="z"),
+        observe=lambda each: each.goals,
+        reward=lambda each: each.goals[:, 0],
+        draw=lambda random: random.uniform(0.0, 0.01, 1),
+        start=start,
+        steps=2,
+    )
+    envs = VectorEnvironment(task, "rgb_array")
+    envs.reset(seed=0)
+    for _ in range(2):
+        envs.step(np.full((2, 1), 0.1, np.float32))
+    torch.testing.assert_close(envs._start, start(envs._now.goals).positions, rtol=0.0, atol=0.0)
+    image = envs.render()[1]
+    assert ((image == image[..., :1]).all(-1) & (image > 60).all(-1) & (image < 250).all(-1)).sum() > 1000  # grey ball
+
+
 def test_invalid_options_are_refused():
     task = cable_reach.cable_reach(2)
     with pytest.raises(SceneError, match="render_mode"):
