@@ -4,12 +4,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from matplotlib.image import imread
+from PIL import Image, ImageOps
 
 from ddg_warp.geometry import meshes
 from ddg_warp.run.figure import rods_picture
 
 BALL = 0.02  # radius of a marker over the size of the shape
+SIZE = (1120, 840)  # width and height of all pictures, so that they make a movie
 
 
 def picture(model, start: np.ndarray, points: np.ndarray, markers: np.ndarray | None = None) -> np.ndarray:
@@ -34,4 +35,5 @@ def picture(model, start: np.ndarray, points: np.ndarray, markers: np.ndarray | 
     with TemporaryDirectory() as folder:
         path = Path(folder) / "picture.png"
         rods_picture(model, [(0.0, start), (1.0, points)], path, names=["start", "now"], bodies=bodies)
-        return np.round(255.0 * imread(path)[..., :3]).astype(np.uint8)
+        with Image.open(path) as image:
+            return np.array(ImageOps.pad(image.convert("RGB"), SIZE, color="white"))

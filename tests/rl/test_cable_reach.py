@@ -93,7 +93,7 @@ def test_pictures_show_goal_start_and_shape():
     for action in actions(5):
         env.step(action)
     after = env.render()
-    assert before.shape == after.shape and before.shape[2] == 3 and before.dtype == np.uint8
+    assert before.shape == after.shape == (840, 1120, 3) and before.dtype == np.uint8
     assert (before != after).any()
     assert env.metadata["render_fps"] == 50.0
     envs.reset(seed=0)

@@ -53,12 +53,14 @@ def test_to_elsewhere_says_how(simulator):
 
 
 def test_a_state_moves_by_world_state(simulator):
-    """The next step of the copy equals that of the original."""
+    """The next step of the copy equals the original's, to the tolerance of steps."""
     state = simulator.step(simulator.initial_state(2))
-    target = Simulator(simulator.model.to("cpu"), dt=0.01)
-    moved = target.step(target.world_state(state)).positions
+    after = simulator.step(state).positions.cpu()
+    with torch.device("cpu"):
+        target = Simulator(simulator.model.to("cpu"), dt=0.01)
+        moved = target.step(target.world_state(state)).positions
     assert moved.device.type == "cpu"
-    torch.testing.assert_close(moved, simulator.step(state).positions.cpu(), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(moved, after, rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
