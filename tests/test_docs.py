@@ -22,7 +22,7 @@ COMMAND = re.compile(r"^    (ddg-warp (?:run|sweep|bench|check|gradients|export|
 FILES = {file: text for page in [*PAGES, *TUTORIALS] for file, text in BLOCK.findall(page.read_text()) if file}
 LONG = ("strands", "bench")
 OPTIONAL = {
-    "torch": "import torch",
+    "torch": "torch",
     "gymnasium": "gymnasium",
     "stable_baselines3": "stable_baselines3",
     "jax": "import jax",
