@@ -6,10 +6,13 @@ import numbers
 from collections.abc import Callable, Iterable
 from dataclasses import fields
 from functools import wraps
+from typing import TypeVar
 
 import numpy as np
 
 from ddg_warp.errors import SceneError, SolverError
+
+Class = TypeVar("Class", bound=type)
 
 NAN = np.nan
 LEAST, MOST = 1e-75, 1e75  # magnitudes of nonzero numbers; fourth powers neither underflow nor overflow
@@ -210,7 +213,7 @@ def meant(name: str, valid: Iterable[str]) -> str:
     return f"{near} T{listing}" if near else f"; t{listing}"
 
 
-def called(kind: type) -> type:
+def called(kind: Class) -> Class:
     """Decorate a class: unfit arguments of the constructor and of public methods raise a `SceneError`."""
     for name, function in list(vars(kind).items()):
         if inspect.isfunction(function) and (name == "__init__" or not name.startswith("_")):
@@ -237,7 +240,7 @@ def _fitting(call: str, function: Callable) -> Callable:
     return fitted
 
 
-def sealed(kind: type) -> type:
+def sealed(kind: Class) -> Class:
     """Decorate a class: finished objects refuse to set unknown public attributes."""
     make = kind.__init__
 

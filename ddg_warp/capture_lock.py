@@ -11,11 +11,14 @@ every garbage collection excludes all others, while launched work runs on. Launc
 
 import gc
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import wraps
+from typing import TypeVar
 
 from ddg_warp.errors import SceneError
+
+Target = TypeVar("Target", bound=Callable)  # a function or class
 
 
 class _Turns:
@@ -110,7 +113,7 @@ _serialise = _Turns()
 launching, capturing = _serialise.launching, _serialise.capturing
 
 
-def launches(target):
+def launches(target: Target) -> Target:
     """Decorate a function that launches, or a class: its constructor loads kernels, its public methods launch.
 
     If threads use one stream, the attributes of such an object are freed in a launching section, too.
@@ -151,7 +154,7 @@ def alone(owner) -> Iterator[None]:
         lock.release()
 
 
-def one_at_a_time(method):
+def one_at_a_time(method: Target) -> Target:
     """Decorate a method that uses scratch memory of the object: calls of several threads are serialised."""
 
     @wraps(method)
@@ -165,7 +168,7 @@ def one_at_a_time(method):
     return entered
 
 
-def stays_here(cls):
+def stays_here(cls: Target) -> Target:
     """Decorate a class with captured launches and scratch memory: serialise public methods, refuse copies and pickling."""
     for name, member in list(vars(cls).items()):
         if not name.startswith("_") and callable(member) and not isinstance(member, type | staticmethod | classmethod):

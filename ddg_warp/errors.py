@@ -1,5 +1,11 @@
 """Errors and warnings of ddg_warp; every message names the object, its index and the remedy."""
 
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ddg_warp.model.state import State
+
 
 class SceneError(ValueError):
     """Invalid scene or argument."""
@@ -27,7 +33,15 @@ class SolverError(RuntimeError):
         gaining: True if an equilibrium search still decreased the energy when its iterations ended.
     """
 
-    def __init__(self, message: str, *, state=None, outcome: str = "", rods=(), gaining: bool = False):
+    def __init__(
+        self,
+        message: str,
+        *,
+        state: "State | None" = None,
+        outcome: str = "",
+        rods: Iterable[int] = (),
+        gaining: bool = False,
+    ):
         super().__init__(message)
         self.state = state
         self.outcome = outcome

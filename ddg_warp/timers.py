@@ -15,11 +15,15 @@ import atexit
 import os
 import sys
 import threading
+from collections.abc import Callable
 from contextlib import ContextDecorator
 from functools import wraps
 from time import perf_counter
+from typing import TypeVar
 
 import warp as wp
+
+Method = TypeVar("Method", bound=Callable)
 
 ON = os.environ.get("DDG_WARP_TIMERS", "0") not in ("", "0")
 LOADING = "load kernels"  # phase apart from the step in which it runs
@@ -105,7 +109,7 @@ def timer(name: str) -> ContextDecorator:
     return _Timer(name) if ON else _nothing
 
 
-def root(name: str):
+def root(name: str) -> Callable[[Method], Method]:
     """Decorate a method of an object with a `model`; outermost calls are the roots of trees, one a device."""
 
     def decorate(method):

@@ -28,6 +28,7 @@ from ddg_warp.errors import DataError, SceneError, SolverError
 from ddg_warp.io.paths import as_path, is_file
 from ddg_warp.run.run_directory import LOCK, TRAJECTORY, lock_directory
 from ddg_warp.run.summary import write_json
+from ddg_warp.typing import FilePath
 
 INDEX, SCRATCH = "index.json", ".partial"
 DONE = "converged"  # outcome of an episode that ran to its end
@@ -57,7 +58,7 @@ class Episode:
     outcome: str = DONE
     failure: str = ""
     seed: int | None = None
-    parameters: dict = field(default_factory=dict)
+    parameters: dict[str, float | str] = field(default_factory=dict)
     seconds: float = 0.0
     frames: int = 0
     worlds: int = 1
@@ -80,7 +81,7 @@ class Episodes:
         DataError: The folder has no index, or the index is damaged.
     """
 
-    def __init__(self, directory, *, outside: bool = False):
+    def __init__(self, directory: FilePath, *, outside: bool = False):
         self.directory = as_path("Episodes: directory", directory)
         self._outside = argument_checks.flag("Episodes: outside", outside)
         path = self.directory / INDEX

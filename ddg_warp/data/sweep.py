@@ -19,6 +19,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from ddg_warp.progress import progress_bar
 from ddg_warp.run.run_directory import TRAJECTORY
 from ddg_warp.run.scene_registry import SHARED, load_scene, parameters, scene_name
 from ddg_warp.run.summary import plain, write_json
+from ddg_warp.typing import FilePath
 
 ABOUT = "sweep.json"
 REFUSED = "refused"  # outcome of parameters of which no scene can be built
@@ -116,15 +118,15 @@ class Run:
 
 
 def sweep(
-    what: str | Callable,
+    what: str | Callable[..., object],
     ranges: Mapping[str, object],
     samples: int,
     *,
-    out,
-    design: str = "random",
+    out: FilePath,
+    design: Literal["random", "latin_hypercube", "sobol", "grid"] = "random",
     seed: int = 0,
     fractions: tuple[float, float, float] | None = None,
-    options: Mapping | None = None,
+    options: Mapping[str, object] | None = None,
     workers: int | None = None,
     ray: bool = False,
     gpus: float = 0.0,

@@ -4,15 +4,20 @@ Plane shapes lie in z = 0 and face +z, round ones face outwards: triangles run c
 The vertex (i, j) of a grid with m vertices in a row is i + m j.
 """
 
+from typing import Literal, TypeAlias
+
 import numpy as np
 
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
+from ddg_warp.typing import Floats, Integers, Numbers
 
-Mesh = tuple[np.ndarray, np.ndarray]
+Mesh: TypeAlias = tuple[Floats, Integers]
 
 
-def rectangle(nx: int, ny: int, size: tuple[float, float] = (1.0, 1.0), pattern: str = "right") -> Mesh:
+def rectangle(
+    nx: int, ny: int, size: tuple[float, float] = (1.0, 1.0), pattern: Literal["right", "alternating"] = "right"
+) -> Mesh:
     """Return a rectangle [0, size[0]] x [0, size[1]] of nx x ny cells.
 
     Args:
@@ -76,7 +81,12 @@ def disc(rings: int, radius: float = 1.0) -> Mesh:
 
 
 def annulus(
-    n_radial: int, n_around: int, inner: float, outer: float, slit: bool = False, pattern: str = "right"
+    n_radial: int,
+    n_around: int,
+    inner: float,
+    outer: float,
+    slit: bool = False,
+    pattern: Literal["right", "alternating"] = "right",
 ) -> Mesh:
     """Return a ring between two circles around the origin.
 
@@ -100,7 +110,12 @@ def annulus(
 
 
 def cylinder_panel(
-    n_around: int, n_along: int, radius: float, length: float, angle: float, pattern: str = "right"
+    n_around: int,
+    n_along: int,
+    radius: float,
+    length: float,
+    angle: float,
+    pattern: Literal["right", "alternating"] = "right",
 ) -> Mesh:
     """Return a sector of a cylinder about the z axis, 0 <= z <= length, symmetric to the x axis, facing outwards.
 
@@ -122,7 +137,9 @@ def cylinder_panel(
     return points, _grid(n_around, n_along, pattern)
 
 
-def cylinder(n_around: int, n_along: int, radius: float, length: float, pattern: str = "right") -> Mesh:
+def cylinder(
+    n_around: int, n_along: int, radius: float, length: float, pattern: Literal["right", "alternating"] = "right"
+) -> Mesh:
     """Return a whole cylinder about the z axis without ends, 0 <= z <= length, facing outwards.
 
     Vertex (i, j) is i + n_around j, with i around from +x towards +y and j along the axis; arguments as in `cylinder_panel`.
@@ -178,7 +195,9 @@ def spherical_cap(rings: int, radius: float = 1.0, angle: float = 0.5 * np.pi) -
     return radius * points, triangles
 
 
-def torus(n_around: int, n_tube: int, major: float, minor: float, pattern: str = "right") -> Mesh:
+def torus(
+    n_around: int, n_tube: int, major: float, minor: float, pattern: Literal["right", "alternating"] = "right"
+) -> Mesh:
     """Return a torus about the z axis, facing outwards.
 
     Args:
@@ -200,7 +219,7 @@ def torus(n_around: int, n_tube: int, major: float, minor: float, pattern: str =
     return points, _grid(n_around, n_tube, pattern, wrap_x=True, wrap_y=True)
 
 
-def drop_unused(points, triangles) -> Mesh:
+def drop_unused(points: Numbers, triangles: Numbers) -> Mesh:
     """Return a mesh without the vertices that no triangle uses; the others keep their order.
 
     Raises:
@@ -217,7 +236,7 @@ def drop_unused(points, triangles) -> Mesh:
     return points[used], renumbered.reshape(triangles.shape)
 
 
-def weld(points, triangles, tolerance: float) -> Mesh:
+def weld(points: Numbers, triangles: Numbers, tolerance: float) -> Mesh:
     """Return a mesh with vertices within a tolerance [m] of each other merged, and triangles that collapse left out.
 
     Raises:

@@ -8,11 +8,12 @@ from ddg_warp import argument_checks
 from ddg_warp.io.curves import CurveSet
 from ddg_warp.io.paths import CurveError, MeshError, MissingFileError, as_path
 from ddg_warp.io.shapes import Curves, Shapes, Surfaces
+from ddg_warp.typing import FilePath
 
 __all__ = ["CurveError", "CurveSet", "Curves", "MeshError", "MissingFileError", "Shapes", "Surfaces", "read"]
 
 
-def read(path, outside: bool = False) -> list[CurveSet]:
+def read(path: FilePath, outside: bool = False) -> list[CurveSet]:
     """Return the curves of a USD, HDF5 or DisMech text file, distinguished by suffix.
 
     Args:

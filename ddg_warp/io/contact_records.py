@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ddg_warp.typing import Floats, Integers
+
 # fields of a pair, with their shapes
 FIELDS = {"world": (), "objects": (2,), "point": (3,), "gap": (), "force": (3,), "friction": (3,)}
 LEAST, MOST = 1e-3, 10.0  # bounds of displayed forces, over the typical force
@@ -25,13 +27,13 @@ class Contacts:
             contact forces at its start. Frictional equilibria depend on the load path; other states at rest have no friction.
     """
 
-    world: np.ndarray
-    objects: np.ndarray
+    world: Integers
+    objects: Integers
     names: list[str]
-    point: np.ndarray
-    gap: np.ndarray
-    force: np.ndarray
-    friction: np.ndarray
+    point: Floats
+    gap: Floats
+    force: Floats
+    friction: Floats
 
     def __len__(self) -> int:
         return len(self.gap)
@@ -50,7 +52,7 @@ class ContactScales:
     size: float
     force: float
 
-    def widths(self, force: np.ndarray) -> np.ndarray:
+    def widths(self, force: Floats) -> Floats:
         """Return the diameters [m] (n,) of balls that show forces (n, 3): the volume is proportional to the force."""
         ratio = np.linalg.norm(force, axis=-1) / self.force
         return 2.0 * self.size * np.cbrt(np.clip(ratio, LEAST, MOST))

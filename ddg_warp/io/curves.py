@@ -6,6 +6,7 @@ import numpy as np
 
 from ddg_warp import argument_checks
 from ddg_warp.io.paths import CurveError
+from ddg_warp.typing import Array, Bools, Floats, Integers, Names
 
 
 @dataclass(frozen=True)
@@ -24,15 +25,15 @@ class CurveSet:
         attributes: Further values of each rod by name, shape (R,), such as ids and groups of a groom; a `Recorder` stores them.
     """
 
-    points: np.ndarray
-    counts: np.ndarray
-    closed: np.ndarray
-    radius: np.ndarray | None
+    points: Floats
+    counts: Integers
+    closed: Bools
+    radius: Floats | None
     path: str
-    attributes: dict[str, np.ndarray] = field(default_factory=dict)
+    attributes: dict[str, Array] = field(default_factory=dict)
 
     @property
-    def names(self) -> np.ndarray:
+    def names(self) -> Names:
         """Name of each rod, shape (R,), str: the last component of `path` for all."""
         return np.full(len(self.counts), self.path.rstrip("/").rpartition("/")[2] or "rods")
 

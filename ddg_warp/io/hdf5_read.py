@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields as fields_of
 from pathlib import Path
@@ -20,6 +20,7 @@ from ddg_warp.io.journal import TrajectoryError, open_to_read
 from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.io.paths import CurveError, existing
 from ddg_warp.io.shapes import Curves, Surfaces
+from ddg_warp.typing import Array, Bools, FilePath, Floats, Integers
 
 CURVE_FIELDS = ("counts", "closed", "radius", "names", "batch")
 SURFACE_FIELDS = ("triangles", "first", "names", "thickness")
@@ -68,7 +69,7 @@ class Frames:
     def __len__(self) -> int:
         return self.shape[0]
 
-    def __getitem__(self, frames) -> np.ndarray:
+    def __getitem__(self, frames: int | slice | Sequence[int]) -> Array:
         if isinstance(frames, int | np.integer) and not -len(self) <= frames < len(self):
             raise MissingFrameError(f"{self._path}: there is no frame {frames}; it has {len(self)}, counted from 0")
         return rows(self._dataset, self._path, frames)
@@ -236,7 +237,7 @@ class TrajectoryReader:
         recorded: Names of the recorded fields.
     """
 
-    def __init__(self, path, *, outside: bool = False):
+    def __init__(self, path: FilePath, *, outside: bool = False):
         self.path = existing(path)
         with undamaged(self.path):
             self._file = open_to_read(self.path)
@@ -255,14 +256,17 @@ class TrajectoryReader:
             raise TrajectoryError(f"{self.path}: there is no group /trajectory; is it a trajectory.h5?")
         trajectory, model = self._file["trajectory"], self._file["model"]
         check_seal(model, self.path)
-        self.time, self.time_is = rows(trajectory["time"], self.path), str(trajectory.attrs.get("time", "state"))
+        self.time: Floats = rows(trajectory["time"], self.path)
+        self.time_is = str(trajectory.attrs.get("time", "state"))
         self.recorded = [name for name in FRAMES if name in trajectory]
         self.recorded += [f"{kind}/{name}" for kind in ("at_points", "at_cells") for name in trajectory.get(kind, ())]
         fields = {name: Frames(trajectory[name], self.path) for name in self.recorded}
         self.points, self.velocities = fields["points"], fields.get("velocities")
         self.directors = fields.get("directors")
         self.fields = {name.rpartition("/")[2]: frames for name, frames in fields.items() if "/" in name}
-        self.series = {name: rows(values, self.path) for name, values in trajectory.get("series", {}).items()}
+        self.series: dict[str, Floats] = {
+            name: rows(values, self.path) for name, values in trajectory.get("series", {}).items()
+        }
         self.curves = Curves(**{name: _array(model["curves"][name]) for name in CURVE_FIELDS})
         self.surfaces = None
         if "surfaces" in model:
@@ -279,31 +283,31 @@ class TrajectoryReader:
         if "contacts" in trajectory:
             self.contacts = ContactFrames(trajectory["contacts"], self.contact_scales.names, self.path)
         _refuse_misfits(self.curves, self.surfaces, self.points.shape[-2])
-        self.parameters = all_arrays(model["parameters"])
-        self.attributes = all_arrays(model["attributes"]) if "attributes" in model else {}
-        self.provenance = {name: _plain(value) for name, value in self._file.attrs.items()}
+        self.parameters: dict[str, Floats] = all_arrays(model["parameters"])
+        self.attributes: dict[str, Array] = all_arrays(model["attributes"]) if "attributes" in model else {}
+        self.provenance: dict[str, object] = {name: _plain(value) for name, value in self._file.attrs.items()}
 
     def __enter__(self) -> TrajectoryReader:
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __len__(self) -> int:
         return len(self.time)
 
     @property
-    def counts(self) -> np.ndarray:
+    def counts(self) -> Integers:
         """Points of each rod, shape (R,), int."""
         return self.curves.counts
 
     @property
-    def closed(self) -> np.ndarray:
+    def closed(self) -> Bools:
         """Closed rods, shape (R,), bool."""
         return self.curves.closed
 
     @property
-    def radius(self) -> np.ndarray:
+    def radius(self) -> Floats:
         """Radius at each point [m], shape (P,)."""
         return self.curves.radius
 
@@ -322,7 +326,7 @@ class TrajectoryReader:
         with undamaged(self.path):
             return int(self._file["checkpoint"][slot].attrs["frame"])
 
-    def checkpoint(self) -> dict[str, np.ndarray]:
+    def checkpoint(self) -> dict[str, Array]:
         """Return the last complete state, for `model.restore`."""
         frame = self.checkpoint_frame
         if frame > len(self):
@@ -332,7 +336,7 @@ class TrajectoryReader:
             check_seal(group, self.path)
             return {name: value for name, value in all_arrays(group).items() if not name.startswith(f"{COUNTS}/")}
 
-    def run_counts(self) -> dict[str, np.ndarray]:
+    def run_counts(self) -> dict[str, Array]:
         """Return counts of the run up to the checkpoint, by name; empty if the file has none."""
         with undamaged(self.path):
             group = self._file["checkpoint"][self.checkpoint_slot]
@@ -344,7 +348,7 @@ class TrajectoryReader:
         self._file.close()
 
 
-def read_rods(path, frame: int = -1, world: int = 0, *, outside: bool = False) -> list[CurveSet]:
+def read_rods(path: FilePath, frame: int = -1, world: int = 0, *, outside: bool = False) -> list[CurveSet]:
     """Return rods of an HDF5 file, a trajectory or a plain file.
 
     A trajectory gives one set for each batch of rods, at one frame (by default the last) of one world.

@@ -17,14 +17,15 @@ from ddg_warp import argument_checks
 from ddg_warp.errors import SceneWarning
 from ddg_warp.io.faces import triangulated
 from ddg_warp.io.paths import MeshError, existing, shown
+from ddg_warp.typing import FilePath, Floats, Integers
 
 BEYOND = 2**31  # a vertex index that no file has; larger numbers are clipped to it
 USD_SUFFIXES = {".usd", ".usda", ".usdc", ".usdz"}
 
 
 def read_mesh(
-    path, prim: str | None = None, weld: float | None = None, outside: bool = False
-) -> tuple[np.ndarray, np.ndarray, str]:
+    path: FilePath, prim: str | None = None, weld: float | None = None, outside: bool = False
+) -> tuple[Floats, Integers, str]:
     """Return the mesh of an OBJ or USD file: (points (P, 3) [m], triangles (T, 3), name).
 
     Convex polygons are cut into fans from the first corner, others by ear clipping. Vertices that no face uses are dropped, with a

@@ -13,6 +13,7 @@ from ddg_warp.geometry.operators import face_normals, vertex_normals
 from ddg_warp.io.shapes import Curves
 from ddg_warp.io.surface_of_revolution import Revolution
 from ddg_warp.scene.obstacles import BALL, CAPSULE, MESH, PLANE
+from ddg_warp.typing import Bools, Floats, Integers, Names
 
 BEYOND = 0.25  # margin of displayed planes around all other objects, over their size
 CELLS = 12  # along each side of a plane
@@ -39,15 +40,15 @@ class Obstacles:
         triangles: Triangles of all meshes, nodes counted from the first of each mesh, shape (T, 3), int.
     """
 
-    names: np.ndarray
-    kinds: np.ndarray
-    radius: np.ndarray
-    counts: np.ndarray
-    moved: np.ndarray
-    rest: np.ndarray
-    spans: np.ndarray
-    sizes: np.ndarray
-    triangles: np.ndarray
+    names: Names
+    kinds: Names
+    radius: Floats
+    counts: Integers
+    moved: Bools
+    rest: Floats
+    spans: Floats
+    sizes: Integers
+    triangles: Integers
 
     @classmethod
     def of(cls, obstacles, points: np.ndarray) -> Obstacles:

@@ -6,6 +6,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from ddg_warp.typing import Bools, Floats, Integers, Names
+
 
 @dataclass(frozen=True)
 class Curves:
@@ -19,14 +21,14 @@ class Curves:
         batch: Batch of each rod, shape (R,), int; rods of a batch have one name and material.
     """
 
-    counts: np.ndarray
-    closed: np.ndarray
-    radius: np.ndarray
-    names: np.ndarray
-    batch: np.ndarray
+    counts: Integers
+    closed: Bools
+    radius: Floats
+    names: Names
+    batch: Integers
 
     @classmethod
-    def tiled(cls, curves, worlds: int) -> Curves:
+    def tiled(cls, curves: Curves, worlds: int) -> Curves:
         """Return `worlds` copies of a model's curves, one after the other."""
         return cls(**{each.name: np.tile(getattr(curves, each.name), worlds) for each in fields(cls)})
 
@@ -42,10 +44,10 @@ class Surfaces:
         thickness: Thickness of each triangle [m], shape (T,), float64.
     """
 
-    triangles: np.ndarray
-    first: np.ndarray
-    names: np.ndarray
-    thickness: np.ndarray
+    triangles: Integers
+    first: Integers
+    names: Names
+    thickness: Floats
 
     def parts(self) -> list[slice]:
         """Return the triangles of each surface."""
@@ -78,13 +80,13 @@ class Shapes:
     """
 
     curves: Curves
-    rows: np.ndarray
+    rows: Integers
     surfaces: Surfaces | None
     point_count: int
     worlds: int
 
     @classmethod
-    def of(cls, curves, surfaces: Surfaces | None = None, worlds: int = 1) -> Shapes:
+    def of(cls, curves: Curves, surfaces: Surfaces | None = None, worlds: int = 1) -> Shapes:
         """Return the shapes of all worlds from the `curves` and `surfaces` of one world of a model."""
         rod_points = int(np.sum(curves.counts))
         point_count = rod_points if surfaces is None else max(rod_points, int(surfaces.triangles.max()) + 1)

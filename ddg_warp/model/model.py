@@ -1,5 +1,6 @@
 """Model: constant device data compiled from a scene: arrays, terms, dof map; and queries of a state."""
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -24,16 +25,19 @@ from ddg_warp.model.fields import Fields
 from ddg_warp.model.parameters import valid_numbers
 from ddg_warp.model.rebuild import ModelBuilder
 from ddg_warp.model.rod_group import RodGroup
-from ddg_warp.model.state import GripState, RodGroupState, State, check_state
+from ddg_warp.model.state import GripState, RodGroupState, Snapshot, State, check_state
 from ddg_warp.model.user_numbering import UserNumbering
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.handle import OBSTACLE, ROD, SHELL, Handle
+from ddg_warp.scene.scene import Scene
+from ddg_warp.typing import Bools, Device, Floats, Numbers, Precision, Vector
 
 if TYPE_CHECKING:
     from ddg_warp.io.contact_records import Contacts
     from ddg_warp.postprocess.quantities import Drag
     from ddg_warp.postprocess.resultants import Stresses
-    from ddg_warp.solve.stepping.wrenches import Reactions
+    from ddg_warp.solve.collision.contact_model import ContactModel
+    from ddg_warp.solve.stepping.wrenches import Reactions, Wrenches
 
 
 @argument_checks.sealed
@@ -57,9 +61,15 @@ class Model:
     """
 
     def __init__(
-        self, scene, *, device=None, precision: str | None = None, worlds: int = 1, allow_rounding: bool = False
+        self,
+        scene: Scene,
+        *,
+        device: Device = None,
+        precision: Precision | None = None,
+        worlds: int = 1,
+        allow_rounding: bool = False,
     ):
-        self.scene = scene
+        self.scene: Scene = scene
         self.wp_device = device_arrays.device_named(device)
         asked = getattr(scene.analysis, "precision", None) if precision is None else precision
         self.types = choose(asked, self.wp_device)
@@ -150,7 +160,7 @@ class Model:
         )
 
     @cached_property
-    def touch(self):
+    def touch(self) -> "ContactModel | None":
         """Contact queries at given states (`ContactModel`); None without contact."""
         from ddg_warp.solve.collision.contact_model import ContactModel
 
@@ -159,7 +169,7 @@ class Model:
         return ContactModel(self.coupled, self.types.real, self.coupled.rest().q)
 
     @cached_property
-    def static_wrenches(self):
+    def static_wrenches(self) -> "Wrenches":
         """`Wrenches` for sums of reactions over supports at states."""
         from ddg_warp.solve.stepping.wrenches import Wrenches
 
@@ -206,7 +216,7 @@ class Model:
         return report(self, argument_checks.flag("report: absent", absent))
 
     @one_at_a_time
-    def energies(self, state: State) -> dict[str, float]:
+    def energies(self, state: State) -> dict[str, float | Floats]:
         """Return energies by term at a state [J]; see `ddg_warp.postprocess.quantities`."""
         from ddg_warp.postprocess.quantities import energies
 
@@ -214,12 +224,12 @@ class Model:
         return energies(self, state)
 
     @one_at_a_time
-    def reactions(self, state: State, **options) -> "Reactions":
+    def reactions(self, state: State, point: Vector | None = None, factor: float = 1.0) -> "Reactions":
         """Return forces and moments of the supports; see `ddg_warp.postprocess.quantities.reactions`."""
         from ddg_warp.postprocess.quantities import reactions
 
         check_state("reactions", self, state)
-        return reactions(self, state, **options)
+        return reactions(self, state, point, factor)
 
     @one_at_a_time
     def drag(self, state: State) -> "Drag":
@@ -253,7 +263,7 @@ class Model:
         check_state("stresses", self, state)
         return stresses(self, state)
 
-    def set_parameter(self, term: str, parameter: str, values) -> None:
+    def set_parameter(self, term: str, parameter: str, values: Numbers) -> None:
         """Set a parameter of a term in all rods and shells, for all worlds or per world.
 
         Args:
@@ -297,7 +307,7 @@ class Model:
         self.layout += remade
         self.fields.forget()
 
-    def valid_values(self, term: str, parameter: str, values) -> np.ndarray:
+    def valid_values(self, term: str, parameter: str, values: Numbers) -> Floats:
         """Return values of a parameter as a checked array of numbers.
 
         Raises:
@@ -306,7 +316,7 @@ class Model:
         rule = self.parameter_rule(term, parameter)
         return valid_numbers(f"{term}.{parameter}", values, *rule)
 
-    def parameter_rule(self, term: str, parameter: str) -> tuple:
+    def parameter_rule(self, term: str, parameter: str) -> tuple[str, Callable[[Floats], Bools]]:
         """Return the rule for values of a parameter: a text, and a predicate of arrays.
 
         Raises:
@@ -334,7 +344,15 @@ class Model:
             terms.setdefault(term.name, {}).update({parameter.name: parameter for parameter in term.parameters})
         return terms
 
-    def set_rest(self, shell: int, *, points=None, metric=None, curvature=None, angle=None) -> None:
+    def set_rest(
+        self,
+        shell: int,
+        *,
+        points: Numbers | None = None,
+        metric: Numbers | None = None,
+        curvature: Numbers | None = None,
+        angle: Numbers | None = None,
+    ) -> None:
         """Set the rest shape of a shell in every world: growth, swelling, bilayers, creases, pre-stress.
 
         Forms left out stay, as do masses and the direction of clamped normals. See `rest_shapes` for forms from principal stretches
@@ -354,7 +372,7 @@ class Model:
 
         set_rest(self, shell, points=points, metric=metric, curvature=curvature, angle=angle)
 
-    def parameters(self) -> dict[str, np.ndarray]:
+    def parameters(self) -> dict[str, Floats]:
         """Return parameters of all terms by name, `group/term/parameter`, broadcastable to (node, column of the group).
 
         Parameters of the coupled system are `net/term/parameter`. Further element sets of a term, with other laws, are numbered:
@@ -376,7 +394,13 @@ class Model:
             result |= {f"net/{force.name}/{name}": values for name, values in force.values.items()}
         return result
 
-    def state(self, points=None, velocities=None, spins=None, angles=None) -> State:
+    def state(
+        self,
+        points: Numbers | None = None,
+        velocities: Numbers | None = None,
+        spins: Numbers | None = None,
+        angles: Numbers | None = None,
+    ) -> State:
         """Return an initial state: the rest state without motion, or given positions and velocities.
 
         Args:
@@ -448,7 +472,7 @@ class Model:
             grips = GripState(wp.zeros(shape, dtype=self.types.real, device=self.wp_device))
         return State(self, [self.group_state(group) for group in self.groups], coupled, grips=grips)
 
-    def restore(self, snapshot: dict[str, np.ndarray]) -> State:
+    def restore(self, snapshot: Snapshot) -> State:
         """Return the state of a `State.snapshot`, bit by bit.
 
         Raises:

@@ -11,11 +11,14 @@ import numpy as np
 
 from ddg_warp import argument_checks
 from ddg_warp.geometry.surface import Surface
-from ddg_warp.model.model import check_model
+from ddg_warp.model.model import Model, check_model
 from ddg_warp.model.rest_forms import FORMS, rest_elements
+from ddg_warp.typing import Floats, Numbers
 
 
-def principal_form(points, triangles, first, second=0.0, direction=(1.0, 0.0, 0.0)) -> np.ndarray:
+def principal_form(
+    points: Numbers, triangles: Numbers, first: Numbers, second: Numbers = 0.0, direction: Numbers = (1.0, 0.0, 0.0)
+) -> Floats:
     """Return the form with principal values `first` along a direction of the surface and `second` across.
 
         q_ij = first (a_i . d1)(a_j . d1) + second (a_i . d2)(a_j . d2)
@@ -43,7 +46,7 @@ def principal_form(points, triangles, first, second=0.0, direction=(1.0, 0.0, 0.
     )
 
 
-def edges_along(points, triangles, direction=(1.0, 0.0, 0.0)) -> np.ndarray:
+def edges_along(points: Numbers, triangles: Numbers, direction: Numbers = (1.0, 0.0, 0.0)) -> Floats:
     """Return components (T, 2, 2) [m] of the edges a1, a2 (columns) along and across a direction (rows).
 
     Arguments as in `principal_form`.
@@ -66,7 +69,13 @@ def edges_along(points, triangles, direction=(1.0, 0.0, 0.0)) -> np.ndarray:
     return np.stack([np.stack([_dot(a, d) for a in (a1, a2)], -1) for d in (along, across)], -2)
 
 
-def grown_metric(points, triangles, first, second=None, direction=(1.0, 0.0, 0.0)) -> np.ndarray:
+def grown_metric(
+    points: Numbers,
+    triangles: Numbers,
+    first: Numbers,
+    second: Numbers | None = None,
+    direction: Numbers = (1.0, 0.0, 0.0),
+) -> Floats:
     """Return the metric (T, 3) [m^2] of a surface stretched along and across a direction.
 
     Arguments as in `principal_form`; `second` is by default `first`. A stretch of 1.1 is a growth by a tenth in length.
@@ -96,7 +105,16 @@ def bilayer_curvature(mismatch: float, h1: float, h2: float, young1: float = 1.0
     return 6.0 * mismatch * (1.0 + m) ** 2 / (h * (3.0 * (1.0 + m) ** 2 + (1.0 + m * n) * (m**2 + 1.0 / (m * n))))
 
 
-def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, angle=None, plate=None) -> None:
+def set_rest(
+    model: Model,
+    shell: int,
+    *,
+    points: Numbers | None = None,
+    metric: Numbers | None = None,
+    curvature: Numbers | None = None,
+    angle: Numbers | None = None,
+    plate: Mapping[str, Floats] | None = None,
+) -> None:
     """Set the rest shape of a shell; see `Model.set_rest`. `plate`: stored values of its `Plate` by name."""
     check_model("set_rest", model)
     if model.coupled is None or not 0 <= argument_checks.index("set_rest: shell", shell) < len(
@@ -112,7 +130,7 @@ def set_rest(model, shell: int, *, points=None, metric=None, curvature=None, ang
     model.note_change(any([part.set_rest(first, parameters) for part, first, parameters in elements]))
 
 
-def set_rest_strains(model, strains: dict) -> None:
+def set_rest_strains(model: Model, strains: Mapping[str, Numbers]) -> None:
     """Set rest stretches, natural curvatures and natural twists of uncoupled rods, element by element.
 
     Args:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import warp as wp
@@ -13,6 +14,13 @@ from ddg_warp.errors import SceneError
 from ddg_warp.geometry import polyline
 from ddg_warp.scene.descriptions import Dynamics
 from ddg_warp.scene.handle import OBSTACLE, Handle
+from ddg_warp.typing import Array, Bools, Floats, Names
+
+if TYPE_CHECKING:
+    from ddg_warp.model.coupled_model import CoupledState
+    from ddg_warp.model.model import Model
+
+Snapshot: TypeAlias = dict[str, Array]  # name -> array
 
 EQUILIBRIUM = ("stable", "outcome", "unbalanced", "sliding")  # set by static solvers
 VELOCITIES = ("v", "omega", "a", "alpha")
@@ -102,11 +110,16 @@ class State:
     """
 
     def __init__(
-        self, model, groups: list[RodGroupState], coupled=None, time: float = 0.0, grips: GripState | None = None
+        self,
+        model: "Model",
+        groups: list[RodGroupState],
+        coupled: "CoupledState | None" = None,
+        time: float = 0.0,
+        grips: GripState | None = None,
     ):
-        self.stable: bool | np.ndarray | None = None
-        self.outcome: str | np.ndarray | None = None
-        self.unbalanced: float | np.ndarray | None = None
+        self.stable: bool | Bools | None = None
+        self.outcome: str | Names | None = None
+        self.unbalanced: float | Floats | None = None
         self.sliding: Sliding | None = None
         self.model = model
         self.groups = groups
@@ -169,7 +182,7 @@ class State:
             )
         return self
 
-    def parts(self) -> dict:
+    def parts(self) -> "dict[str, RodGroupState | CoupledState | GripState]":
         """Return the states of rod groups, the coupled system and grips, by name."""
         single = {"net": self.coupled, "grips": self.grips}
         groups = {str(i): group for i, group in enumerate(self.groups)}
@@ -191,7 +204,7 @@ class State:
         """Slip velocities of dof blocks (W N,) for friction."""
         return self.coupled.v if self.sliding is None else self.sliding.velocity
 
-    def points(self, item: int | str | Sequence[int] | None = None) -> np.ndarray:
+    def points(self, item: int | str | Sequence[int] | None = None) -> Floats:
         """Return positions (P, 3) or (worlds, P, 3) [m]: nodes in the order of `model.curves`, then vertices.
 
         Args:
@@ -200,7 +213,7 @@ class State:
         """
         return self._of_nodes(item, [group.x for group in self.groups], self.coupled and self.coupled.q)
 
-    def velocities(self, item: int | str | Sequence[int] | None = None) -> np.ndarray:
+    def velocities(self, item: int | str | Sequence[int] | None = None) -> Floats:
         """Return velocities of nodes [m/s], ordered and chosen as in `points`."""
         return self._of_nodes(item, [group.v for group in self.groups], self.coupled and self.coupled.v)
 
@@ -214,7 +227,7 @@ class State:
         values = order.nodes([group.numpy() for group in groups], blocks)
         return values if item is None else order.nodes_of(item, values)
 
-    def obstacle_points(self) -> np.ndarray:
+    def obstacle_points(self) -> Floats:
         """Return positions of nodes of moving obstacles (M, 3) or (worlds, M, 3) [m], see `Model.obstacles`."""
         model = self.model
         if model.obstacles is None:
@@ -223,7 +236,7 @@ class State:
         values = self.coupled.q.numpy().astype(float).reshape(model.worlds, -1, 3)[:, nodes]
         return values[0] if model.worlds == 1 else values
 
-    def tangents(self, item: int | str | Sequence[int] | None = None) -> np.ndarray:
+    def tangents(self, item: int | str | Sequence[int] | None = None) -> Floats:
         """Return unit tangents of edges (edges, 3) or (worlds, edges, 3), of all rods, or of rods chosen as in `points`."""
         order, points = self.model.order, self.points()
         edges = []
@@ -234,7 +247,7 @@ class State:
         tangents = edges / np.linalg.norm(edges, axis=-1, keepdims=True)
         return tangents if item is None else order.edges_of(item, tangents, 3)
 
-    def angles(self, item: int | str | Sequence[int] | None = None) -> np.ndarray | None:
+    def angles(self, item: int | str | Sequence[int] | None = None) -> Floats | None:
         """Return twist angles of edges (edges,) or (worlds, edges) [rad]; None if no rod has twist.
 
         Args:
@@ -247,7 +260,7 @@ class State:
         result = model.order.edges([data.theta.numpy() for data in self.groups], coupled)
         return result if item is None or result is None else model.order.edges_of(item, result)
 
-    def directors(self, item: int | str | Sequence[int] | None = None) -> np.ndarray | None:
+    def directors(self, item: int | str | Sequence[int] | None = None) -> Floats | None:
         """Return the first material director of edges (edges, 3) or (worlds, edges, 3); None without twist.
 
         Args:
@@ -272,7 +285,7 @@ class State:
         result = model.order.edges(values, coupled, 3)
         return result if item is None or result is None else model.order.edges_of(item, result, 3)
 
-    def poses(self) -> np.ndarray | None:
+    def poses(self) -> Floats | None:
         """Return poses of grips (grips, 6) or (worlds, grips, 6) in the order of `model.grips`; None without."""
         if self.grips is None:
             return None
@@ -308,7 +321,7 @@ class State:
                 if name in VELOCITIES:
                     array.zero_()
 
-    def snapshot(self) -> dict[str, np.ndarray]:
+    def snapshot(self) -> Snapshot:
         """Return the data for a bitwise restart, by name."""
         spun = {"spun": np.bool_(True)} if self.spun else {}
         values = {name: arrays.download(array) for name, array in self.arrays().items()}

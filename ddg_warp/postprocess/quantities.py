@@ -7,20 +7,21 @@ import numpy as np
 from ddg_warp import argument_checks, device_arrays
 from ddg_warp.capture_lock import launches
 from ddg_warp.kernels.terms import AXISYMMETRIC, MAGNETS, SHELLS
-from ddg_warp.model.model import check_model
-from ddg_warp.model.state import query
+from ddg_warp.model.model import Model, check_model
+from ddg_warp.model.state import State, query
 from ddg_warp.postprocess import end_moments
 from ddg_warp.postprocess.element_strains import coupled_strains, group_strains
 from ddg_warp.postprocess.resultants import Stresses
 from ddg_warp.solve.equilibrium.tangent import Tangent
 from ddg_warp.solve.forces.drag import CoupledDrag, RodGroupDrag
 from ddg_warp.solve.stepping.wrenches import Reaction, Reactions
+from ddg_warp.typing import Floats, Numbers, Vector
 
 TWIST = 2  # index of the twist among the strains of rod vertices and of half cells at joints
 
 
 @launches
-def energies(model, state) -> dict:
+def energies(model: Model, state: State) -> dict[str, float | Floats]:
     """Return elastic energies by term, kinetic and gravitational energy [J]; arrays (worlds,) of several worlds.
 
     The potential of gravity is zero at the origin. User-defined forces with a potential have energies by name.
@@ -40,7 +41,7 @@ def energies(model, state) -> dict:
 
 
 @launches
-def reactions(model, state, point=None, factor: float = 1.0) -> Reactions:
+def reactions(model: Model, state: State, point: Vector | None = None, factor: float = 1.0) -> Reactions:
     """Return the reaction of every support of the scene at a state; `Integrator.wrenches` is for a step.
 
     Supports are ordered as added: of rods, then of shells, rings and obstacles. `reactions(...)["left"]` is that of a support or
@@ -91,13 +92,13 @@ class Drag:
         power: of force and moment [W]; negative in a fluid at rest.
     """
 
-    force: np.ndarray
-    moment: np.ndarray | None
-    power: float | np.ndarray
+    force: Floats
+    moment: Floats | None
+    power: float | Floats
 
 
 @launches
-def drag(model, state) -> Drag:
+def drag(model: Model, state: State) -> Drag:
     """Return the drag at a state, from velocities and flow.
 
     Massless rods have the velocities of the last step: with implicit Euler at its end. With the midpoint rule, velocities are means
@@ -146,7 +147,7 @@ def _each_world(values: np.ndarray) -> np.ndarray:
 
 
 @launches
-def stresses(model, state) -> Stresses:
+def stresses(model: Model, state: State) -> Stresses:
     """Return conjugate stresses of every rod and shell by term (elements, strains), or (worlds, elements, strains).
 
     `stresses(...).rod(rod)` has axial force, shear, moments and torque of one rod in space, `stresses(...).shell(shell)` membrane
@@ -185,7 +186,7 @@ def stresses(model, state) -> Stresses:
 
 
 @launches
-def triangle_fields(model, state) -> dict[str, np.ndarray]:
+def triangle_fields(model: Model, state: State) -> dict[str, Floats]:
     """Return scalar fields of triangles (worlds, triangles) by name, in the order of `model.surfaces`.
 
     - "strain": largest principal value in magnitude of Green's strain.
@@ -269,7 +270,7 @@ def _resultants(slope: np.ndarray, metric) -> np.ndarray:
     return np.stack([n[:, 0, 0], n[:, 1, 1], n[:, 0, 1]], -1)
 
 
-def writhe(points: np.ndarray) -> float:
+def writhe(points: Numbers) -> float:
     """Return the writhe of a closed polygon (n, 3) by the exact Gauss integral (Klenin, Langowski 2000, method 1a)."""
     points = argument_checks.array("writhe: points", points, "give (n, 3)")
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 3 or not np.isfinite(points).all():
@@ -290,7 +291,7 @@ def writhe(points: np.ndarray) -> float:
 
 
 @launches
-def total_twist(model, state, rod: int = 0) -> float | np.ndarray:
+def total_twist(model: Model, state: State, rod: int = 0) -> float | Floats:
     """Return the total twist of a rod in revolutions; an array (worlds,) of several worlds.
 
     Total twist is the sum of angles between adjacent directors after parallel transport. Full revolutions between neighbours count as

@@ -14,6 +14,7 @@ from ddg_warp.geometry import polyline
 from ddg_warp.kernels.terms import MAGNETS
 from ddg_warp.postprocess.element_strains import coupled_strains, group_strains
 from ddg_warp.scene.handle import SHELL
+from ddg_warp.typing import Floats
 
 AXIAL = ("rod_stretch", "planar_stretch")
 BENDING = ("shell_bend", "shell_bend_dof")
@@ -36,10 +37,10 @@ class RodResultants:
         units: unit of each attribute.
     """
 
-    axial_force: np.ndarray
-    shear: np.ndarray
-    moment: np.ndarray
-    torque: np.ndarray
+    axial_force: Floats
+    shear: Floats
+    moment: Floats
+    torque: Floats
 
     units: ClassVar[dict[str, str]] = {"axial_force": "N", "shear": "N", "moment": "N m", "torque": "N m"}
 
@@ -58,14 +59,14 @@ class ShellResultants:
         units: unit of each attribute.
     """
 
-    membrane_force: np.ndarray
-    moment: np.ndarray | None
-    von_mises: np.ndarray
+    membrane_force: Floats
+    moment: Floats | None
+    von_mises: Floats
 
     units: ClassVar[dict[str, str]] = {"membrane_force": "N/m", "moment": "N", "von_mises": "Pa"}
 
 
-class Stresses(dict):
+class Stresses(dict[str, list[Floats]]):
     """Conjugate stresses by term, see `quantities.stresses`; stress resultants of one object by `rod` and `shell`."""
 
     def __init__(self, values: dict[str, list], model, state):

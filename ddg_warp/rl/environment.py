@@ -13,9 +13,10 @@ from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core import outcome
 from ddg_warp.model.controls import Controls
 from ddg_warp.torch.rotations import turned
-from ddg_warp.torch.simulator import Simulator, WorldState
+from ddg_warp.torch.simulator import Parameters, Simulator, WorldState
 from ddg_warp.torch.state_layout import along
 from ddg_warp.torch.wrenches import WrenchTensors, without_gradient
+from ddg_warp.typing import Names, Numbers
 
 GOOD = CONVERGED, _ = tuple(outcome.NAMES[code] for code in (outcome.CONVERGED, outcome.NO_GRADIENT))
 AXES = "xyz"
@@ -75,7 +76,7 @@ class EpisodeState:
     goals: torch.Tensor
     actions: torch.Tensor
     steps: torch.Tensor
-    outcomes: np.ndarray
+    outcomes: Names
     wrenches: WrenchTensors | None = None
 
     def __repr__(self) -> str:
@@ -130,14 +131,14 @@ class Environment:
         worlds: int,
         rates: GripRates | Sequence[GripRates],
         *,
-        observe: Callable,
-        reward: Callable,
+        observe: Callable[[EpisodeState], torch.Tensor],
+        reward: Callable[[EpisodeState], torch.Tensor],
         steps: int,
-        terminated: Callable | None = None,
-        draw: Callable | None = None,
-        start: WorldState | Callable | None = None,
+        terminated: Callable[[EpisodeState], torch.Tensor] | None = None,
+        draw: Callable[[np.random.Generator], Numbers] | None = None,
+        start: WorldState | Callable[[torch.Tensor], WorldState] | None = None,
         substeps: int = 1,
-        parameters: dict | None = None,
+        parameters: Parameters | None = None,
         wrenches: bool = False,
     ):
         if not isinstance(simulator, Simulator):
@@ -192,7 +193,7 @@ class Environment:
         return [np.random.default_rng(stream) for stream in np.random.SeedSequence(seed).spawn(self.worlds)]
 
     def begin(
-        self, generators: list, now: EpisodeState | None = None, mask: torch.Tensor | None = None
+        self, generators: list[np.random.Generator], now: EpisodeState | None = None, mask: torch.Tensor | None = None
     ) -> EpisodeState:
         """Begin episodes, in all worlds or in the worlds of a mask (B,); the others stay as in `now`.
 

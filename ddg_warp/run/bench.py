@@ -7,17 +7,21 @@ time relative to the scene's defaults, next to its error. `ddg_warp.run.bench_ov
 import itertools
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
+from types import MappingProxyType, ModuleType
+from typing import TypeAlias
 
 import numpy as np
 
 from ddg_warp.run.scene_registry import InputError, load_scene, parameters, scene_name
 from ddg_warp.run.simulate import Result, simulate
 from ddg_warp.scene.scene import Dynamics
+from ddg_warp.typing import Numbers, Precision
+
+Setting: TypeAlias = float | str | None
+Row: TypeAlias = dict[str, Setting]  # settings and measured values by name
 
 LOG = logging.getLogger("ddg_warp")
 RUN_SETTINGS = ("dt", "duration", "precision")
@@ -50,10 +54,10 @@ class Study:
         InputError: `one_by_one` is combined with series, or varies a value that is no number.
     """
 
-    grid: Mapping[str, tuple]
-    measure: Callable[[Result], Any] | str
-    reference: Any = None
-    fixed: Mapping[str, Any] = field(default_factory=dict)
+    grid: Mapping[str, Sequence[Setting]]
+    measure: Callable[[Result], Numbers] | str
+    reference: Numbers | Mapping[str, Setting] | None = None
+    fixed: Mapping[str, Setting] = field(default_factory=dict)
     series: tuple[str, ...] = ()
     unit: str = ""
     scale: float | None = None
@@ -71,7 +75,7 @@ class Study:
                 f"a study varies '{name}' one by one; it varies numbers, and '{name}' is better in `fixed`"
             )
 
-    def cases(self, usual: Mapping = MappingProxyType({})) -> list[dict]:
+    def cases(self, usual: Mapping[str, Setting] = MappingProxyType({})) -> list[Row]:
         """Return all combinations of the grid, the last name fastest; or, one by one, variations of `usual`."""
         if self.one_by_one:
             variations = ((n, v) for n, values in self.grid.items() for v in values if v != usual.get(n))
@@ -79,7 +83,7 @@ class Study:
         return [dict(zip(self.grid, values, strict=True)) for values in itertools.product(*self.grid.values())]
 
 
-def study_of(module) -> Study:
+def study_of(module: ModuleType) -> Study:
     """Return the study of a scene: its own, or its first check over resolution or time step.
 
     Raises:
@@ -113,8 +117,8 @@ def benchmark(
     out: str | Path,
     *,
     device: str | None = None,
-    precision: str | None = None,
-    given: Mapping[str, Any] | None = None,
+    precision: Precision | None = None,
+    given: Mapping[str, Setting] | None = None,
 ) -> bool:
     """Run a scene's study; write NAME.csv, NAME.json and NAME.png into `out`.
 
@@ -162,7 +166,9 @@ def benchmark(
     return not any(row["failure"] for row in rows)
 
 
-def measure(module, study: Study, *, device: str | None = None, precision: str | None = None) -> tuple[list[dict], str]:
+def measure(
+    module: ModuleType, study: Study, *, device: str | None = None, precision: Precision | None = None
+) -> tuple[list[Row], str]:
     """Run all cases of a study, the scene's defaults and their reference runs, each once.
 
     Returns:
@@ -239,7 +245,7 @@ def _of_check(module, study: Study, result: Result) -> tuple[float, float, str]:
     return check.error, abs(float(check.reference)) or 1.0, unit or "1"
 
 
-def defaults(module, study: Study, device: str | None) -> dict:
+def defaults(module: ModuleType, study: Study, device: str | None) -> Row:
     """Return the default values of the names of a study's grid."""
     import warp as wp
 
@@ -265,7 +271,7 @@ def _alike(case: Mapping, usual: Mapping) -> bool:
     )
 
 
-def run(module, settings: Mapping, device: str | None) -> Result:
+def run(module: ModuleType, settings: Mapping[str, Setting], device: str | None) -> Result:
     """Run one case without recording.
 
     Raises:
@@ -296,7 +302,7 @@ def clock_of(device: str | None) -> Callable[[], float] | None:
     return None if wp.get_device(device).is_cuda else time.process_time
 
 
-def best(study: Study, rows: list[dict]) -> list[dict]:
+def best(study: Study, rows: list[Row]) -> list[Row]:
     """Return the cases on the Pareto front of error and time in each series; all cases without series.
 
     Failed cases have no error and are left out if there are series.
@@ -314,7 +320,7 @@ def best(study: Study, rows: list[dict]) -> list[dict]:
     return sorted(front, key=lambda row: order.index(tuple(row[name] for name in study.series)))
 
 
-def orders(study: Study, rows: list[dict]) -> dict[str, float]:
+def orders(study: Study, rows: list[Row]) -> dict[str, float]:
     """Return observed orders of convergence by setting: median slope of log(error) over log(setting).
 
     For a number of edges, cells or steps, it is the order in their size. Other settings are as in the case of least error, or at
@@ -337,12 +343,12 @@ def orders(study: Study, rows: list[dict]) -> dict[str, float]:
     return result
 
 
-def line_through(study: Study, rows: list[dict], case: Mapping, name: str) -> list[dict]:
+def line_through(study: Study, rows: list[Row], case: Mapping[str, Setting], name: str) -> list[Row]:
     """Return rows that differ from a case in at most one name of the grid."""
     return [row for row in rows if all(row[key] == case[key] for key in study.grid if key != name)]
 
 
-def plot(study: Study, rows: list[dict], path: Path, title: str, unit: str) -> None:
+def plot(study: Study, rows: list[Row], path: Path, title: str, unit: str) -> None:
     """Plot error over time, a line a series, with defaults marked; see `Study.series` and `Study.one_by_one`."""
     try:
         from ddg_warp.run.figure import error_plot

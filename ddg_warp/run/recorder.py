@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +23,11 @@ from ddg_warp.run.run_directory import (
     refuse_to_replace,
     system_error,
 )
+from ddg_warp.typing import Array, FilePath, Numbers
+
+if TYPE_CHECKING:
+    from ddg_warp.model.model import Model
+    from ddg_warp.model.state import State
 
 DEFAULT_FPS = 24.0
 LEAST_DT = 1e-300  # [s], with a finite inverse
@@ -71,8 +77,8 @@ class Recorder:
 
     def __init__(
         self,
-        model,
-        directory,
+        model: Model,
+        directory: FilePath | RunDirectory,
         *,
         usd: bool = True,
         hdf5: bool = True,
@@ -86,12 +92,12 @@ class Recorder:
         directors: bool = False,
         fields: Sequence[str] = (),
         contacts: bool = False,
-        attributes: Mapping[str, np.ndarray] | None = None,
-        provenance: Mapping | None = None,
-        control: Mapping | None = None,
+        attributes: Mapping[str, Array] | None = None,
+        provenance: Mapping[str, object] | None = None,
+        control: Mapping[str, object] | None = None,
         resume: bool = False,
         force: bool = False,
-        counts: Callable[[], Mapping[str, np.ndarray]] | None = None,
+        counts: Callable[[], Mapping[str, Array]] | None = None,
     ):
         if not hasattr(model, "curves"):
             raise SceneError(f"Recorder: the model is {type(model).__name__}; give what scene.build() returns")
@@ -203,12 +209,12 @@ class Recorder:
     def __enter__(self) -> Recorder:
         return self
 
-    def __exit__(self, kind, error, _) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         if isinstance(error, RecordError):
             return  # already closed
         self.close()
 
-    def record(self, state, observed: Mapping[str, float] | None = None) -> None:
+    def record(self, state: State, observed: Mapping[str, Numbers] | None = None) -> None:
         """Record a state; call it for the first state and after every step.
 
         The first state of a resumed run may be its checkpoint, which is skipped.

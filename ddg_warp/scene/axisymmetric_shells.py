@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.handle import AXISYMMETRIC, RING_SUPPORT, Handle, need
 from ddg_warp.scene.material import Material
 from ddg_warp.scene.prescribed_motion import Motion
+from ddg_warp.typing import Amplitude, End, Numbers, Selection
 
 ENDS = {"first": 0, "last": -1}
 
@@ -74,7 +76,13 @@ class Meridians:
     ring_pressures: list[RingPressure] = field(default_factory=list, init=False)
 
     def add_axisymmetric_shell(
-        self, points, *, thickness, material: Material, rest="shape", name: str = "shell of revolution"
+        self,
+        points: Numbers,
+        *,
+        thickness: Numbers,
+        material: Material,
+        rest: Literal["shape"] | tuple[Numbers, Numbers] = "shape",
+        name: str = "shell of revolution",
     ) -> Handle:
         """Add a shell of revolution about the z axis with axisymmetric deformation, by its meridian in the plane of x and z.
 
@@ -116,7 +124,7 @@ class Meridians:
         return Handle(len(self.axisymmetric_shells) - 1, AXISYMMETRIC, name)
 
     def hold_ring(
-        self, shell: int, nodes, components: str = "xz", motion: Motion | Grip | None = None, name: str = ""
+        self, shell: int, nodes: Selection, components: str = "xz", motion: Motion | Grip | None = None, name: str = ""
     ) -> Handle:
         """Fix radius ("x") or height ("z") of nodes of a meridian, free to rotate (simply supported).
 
@@ -128,9 +136,9 @@ class Meridians:
     def clamp_ring(
         self,
         shell: int,
-        end: str,
+        end: End,
         components: str = "xz",
-        tangent=None,
+        tangent: Numbers | None = None,
         motion: Motion | Grip | None = None,
         name: str = "",
     ) -> Handle:
@@ -152,14 +160,16 @@ class Meridians:
         options = {"tangent": tangent, "clamped": True, "motion": motion, "call": "clamp_ring", "name": name}
         return self._hold_ring(RingSupport(shell, nodes, components, **options))
 
-    def symmetry_ring(self, shell: int, end: str, name: str = "") -> Handle:
+    def symmetry_ring(self, shell: int, end: End, name: str = "") -> Handle:
         """Add a symmetry plane normal to the axis at a rim, orthogonal to the meridian."""
         node = self._end(shell, end)
         points = self.axisymmetric_shells[shell].points
         edge = points[1] - points[0] if node == 0 else points[-1] - points[-2]
         return self.clamp_ring(shell, end, "z", tangent=(0.0, np.copysign(1.0, edge[1])), name=name)
 
-    def add_ring_force(self, shell: int, nodes, force, amplitude: Callable[[float], float] | None = None) -> Handle:
+    def add_ring_force(
+        self, shell: int, nodes: Selection, force: Numbers, amplitude: Amplitude | None = None
+    ) -> Handle:
         """Add a dead force per length of ring at rest on nodes (2,) or (n, 2): radial and axial [N/m]."""
         nodes = argument_checks.once("add_ring_force: nodes", self._nodes(shell, nodes))
         radius = self.axisymmetric_shells[shell].points[nodes, 0]
@@ -170,7 +180,9 @@ class Meridians:
         self.ring_loads.append(RingLoad(shell, nodes, 2.0 * np.pi * radius[:, None] * force, amplitude))
         return Handle(len(self.ring_loads) - 1, "ring load")
 
-    def add_pole_force(self, shell: int, force: float, end: str = "first", amplitude=None) -> Handle:
+    def add_pole_force(
+        self, shell: int, force: float, end: End = "first", amplitude: Amplitude | None = None
+    ) -> Handle:
         """Add a dead axial force [N] on a pole."""
         node = self._end(shell, end)
         if self.axisymmetric_shells[shell].points[node, 0] != 0.0:
@@ -181,7 +193,13 @@ class Meridians:
         return Handle(len(self.ring_loads) - 1, "ring load")
 
     def add_axisymmetric_pressure(
-        self, shell: int, pressure, edges=None, *, dead: bool = False, amplitude=None
+        self,
+        shell: int,
+        pressure: Numbers,
+        edges: Selection | None = None,
+        *,
+        dead: bool = False,
+        amplitude: Amplitude | None = None,
     ) -> Handle:
         """Add pressure [Pa] on edges (all by default), towards the left of the meridian in the plane of x and z.
 

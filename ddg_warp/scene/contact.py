@@ -1,8 +1,9 @@
 """Contact of a scene: colliding objects, contact potential, friction and obstacles."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import Literal
 
 import numpy as np
 
@@ -68,7 +69,7 @@ class Contacts:
     def contact(
         self,
         *,
-        law: str | Law = "barrier",
+        law: Literal["barrier", "penalty"] | Law = "barrier",
         range: float | None = None,
         stiffness: float | None = None,
         friction: float = 0.0,
@@ -78,7 +79,7 @@ class Contacts:
         rolling: bool = False,
         exclusion_length: float | None = None,
         radius: Mapping[str, float] | None = None,
-        objects=None,
+        objects: str | Sequence[str] | None = None,
     ) -> None:
         """Enable contact of rods, shells and obstacles without interpenetration.
 

@@ -13,6 +13,7 @@ from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.law import Law
 from ddg_warp.scene.material import Material, Stiffness
 from ddg_warp.scene.prescribed_motion import Motion
+from ddg_warp.typing import Precision, Scheme
 
 RUN = 2**16  # nodes
 
@@ -35,9 +36,9 @@ class Dynamics:
 
     dt: float = 0.01
     duration: float = 1.0
-    scheme: str = "implicit_euler"
+    scheme: Scheme = "implicit_euler"
     rtol: float = 1e-6
-    precision: str | None = None
+    precision: Precision | None = None
     unconverged_fraction: float = 0.0
     error: float | None = None
 

@@ -10,6 +10,7 @@ import numpy as np
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.scene.field import Field
+from ddg_warp.typing import Floats, Numbers
 
 # c_t and c_n of `Viscous`
 THEORIES = {
@@ -37,12 +38,12 @@ class Resistance:
             unit = "N s" if name == "rotational" else "N s/m^2"
             object.__setattr__(self, name, _numbers(f"drag: {name}", getattr(self, name), unit))
 
-    def spread(self, along: Callable) -> "Resistance":
+    def spread(self, along: Callable[[str, Floats], Floats]) -> "Resistance":
         """Return the law with values on edges, `along(name, values)` of the values along rods."""
         names = "tangential", "normal", "rotational"
         return replace(self, **{name: along(name, getattr(self, name)) for name in names})
 
-    def coefficients(self, where: str, radius: np.ndarray, length: np.ndarray) -> list:
+    def coefficients(self, where: str, radius: Floats, length: Floats) -> list[float | Floats]:
         """Return rows of `kernels.forces.drag` for edges of radii (R, edges) of rods of lengths (R, 1)."""
         return [self.tangential, self.normal, self.rotational, 0.0, 0.0, 0.0, 0.0, 0.0]
 
@@ -70,7 +71,7 @@ class Viscous:
     viscosity: float
     theory: str = "cox"
     scale: float | None = None
-    radius: float | np.ndarray | None = None
+    radius: Numbers | None = None
 
     def __post_init__(self):
         argument_checks.positive("Viscous: viscosity", self.viscosity, "Pa s")
@@ -82,11 +83,11 @@ class Viscous:
         elif self.theory != "cox":
             raise SceneError(f"Viscous: theory {self.theory!r} needs a scale [m], the length of a wave")
 
-    def spread(self, along: Callable) -> "Viscous":
+    def spread(self, along: Callable[[str, Floats], Floats]) -> "Viscous":
         """Return the law with values on edges, `along(name, values)` of the values along rods."""
         return self if self.radius is None else replace(self, radius=along("radius", self.radius))
 
-    def coefficients(self, where: str, radius: np.ndarray, length: np.ndarray) -> list:
+    def coefficients(self, where: str, radius: Floats, length: Floats) -> list[float | Floats]:
         """Return rows of `kernels.forces.drag` for edges of radii (R, edges) of rods of lengths (R, 1).
 
         Raises:
@@ -133,7 +134,7 @@ class Granular:
     angle: float = 0.2416  # 13.84 degrees
     speed: float = 1e-3
 
-    def spread(self, along: Callable) -> "Granular":
+    def spread(self, along: Callable[[str, Floats], Floats]) -> "Granular":
         """Return the law itself, without values along rods."""
         return self
 
@@ -147,7 +148,7 @@ class Granular:
         )
         argument_checks.positive("Granular: speed", self.speed, "m/s")
 
-    def coefficients(self, where: str, radius: np.ndarray, length: np.ndarray) -> list:
+    def coefficients(self, where: str, radius: Floats, length: Floats) -> list[float | Floats]:
         """Return rows of `kernels.forces.drag` for edges of radii (R, edges) of rods of lengths (R, 1)."""
         return [0.0, 0.0, 0.0, self.lateral, self.friction, self.leading, np.tan(self.angle), self.speed]
 

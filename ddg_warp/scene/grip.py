@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ddg_warp import argument_checks
+from ddg_warp.typing import Floats, Vector
 
 
 @argument_checks.called
@@ -23,7 +24,7 @@ class Grip:
         pivot: centre of rotation at rest (3,) [m].
     """
 
-    pivot: tuple = (0.0, 0.0, 0.0)
+    pivot: Vector = (0.0, 0.0, 0.0)
 
     # interface of `Motion` for compilation: one pose for all nodes, which may rotate, and may be planar (`Controls` are checked)
     count = None
@@ -33,7 +34,7 @@ class Grip:
     def __post_init__(self):
         object.__setattr__(self, "pivot", argument_checks.vector("Grip: pivot", self.pivot))
 
-    def pose(self, t0: float, t1: float, start: float = 0.0, part: float = 1.0) -> np.ndarray:
+    def pose(self, t0: float, t1: float, start: float = 0.0, part: float = 1.0) -> Floats:
         """Return the row of `Motion.pose` (1, 21) of a grip at rest; the device adds the pose."""
         return np.concatenate([np.zeros(3), np.eye(3).ravel(), self.pivot, np.zeros(6)])[None]
 
@@ -41,7 +42,7 @@ class Grip:
         """Return None: a grip never jumps within a step."""
         return None
 
-    def turn(self, poses: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    def turn(self, poses: Floats, vectors: Floats) -> Floats:
         """Return vectors of the rest state (n, 3) rotated by poses (worlds, 6): (worlds, n, 3)."""
         from scipy.spatial.transform import Rotation
 

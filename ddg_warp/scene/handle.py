@@ -1,11 +1,14 @@
 """Handles: indices of the objects of a scene that know their kind and name."""
 
 from collections.abc import Iterator, Sequence
+from typing import overload
 
 import numpy as np
+import numpy.typing as npt
 
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
+from ddg_warp.typing import Integers
 
 ROD, SHELL, OBSTACLE, SUPPORT, LOAD = "rod", "shell", "obstacle", "support", "load"
 SHELL_SUPPORT, RING_SUPPORT = "shell support", "ring support"
@@ -39,7 +42,7 @@ class Handle(int):
     __str__ = int.__repr__
 
 
-class Handles(Sequence):
+class Handles(Sequence[Handle]):
     """Handles of consecutive rods, made one at a time when needed."""
 
     def __init__(self, indices: range, name: str):
@@ -48,21 +51,27 @@ class Handles(Sequence):
     def __len__(self) -> int:
         return len(self._indices)
 
-    def __getitem__(self, item):
+    @overload
+    def __getitem__(self, item: int) -> Handle: ...
+
+    @overload
+    def __getitem__(self, item: slice) -> "Handles": ...
+
+    def __getitem__(self, item: int | slice) -> "Handle | Handles":
         chosen = self._indices[item]
         return Handles(chosen, self._name) if isinstance(chosen, range) else Handle(chosen, ROD, self._name)
 
     def __iter__(self) -> Iterator[Handle]:
         return (Handle(index, ROD, self._name) for index in self._indices)
 
-    def __contains__(self, item) -> bool:
+    def __contains__(self, item: object) -> bool:
         return item in self._indices
 
-    def __array__(self, dtype=None, copy=None) -> np.ndarray:
+    def __array__(self, dtype: "npt.DTypeLike | None" = None, copy: bool | None = None) -> Integers:
         indices = self._indices
         return np.arange(indices.start, indices.stop, indices.step, dtype=dtype)
 
-    def __eq__(self, sequence) -> bool:
+    def __eq__(self, sequence: object) -> bool:
         return list(self._indices) == list(sequence) if isinstance(sequence, Sequence) else NotImplemented
 
     def __hash__(self) -> int:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
+from ddg_warp.typing import Numbers
 
 
 @dataclass(frozen=True, init=False)
@@ -21,9 +22,9 @@ class Law:
     """
 
     density: object
-    values: dict
+    values: "dict[str, Numbers | list[Numbers]]"
 
-    def __init__(self, density, **values):
+    def __init__(self, density: object, **values: "Numbers | list[Numbers]"):
         for name, entry in values.items():
             for number in entry if isinstance(entry, list | tuple) else [entry]:
                 array = argument_checks.array(

@@ -1,5 +1,6 @@
 """Magnetism of a scene: magnetised rods, the applied field, and dipole pairs."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.scene.field import Field
+from ddg_warp.typing import Numbers, Selection, Vector
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ class Magnets:
     dipoles: list[Dipoles] = field(default_factory=list, init=False)
     applied_field: MagneticField | None = field(default=None, init=False)
 
-    def magnetize(self, rods, magnetisation, edges=None) -> None:
+    def magnetize(self, rods: Selection, magnetisation: Numbers, edges: Selection | None = None) -> None:
         """Add a magnetisation of rods, fixed in the material frame of edges (hard-magnetic elastomer).
 
         The dipole moment of an edge is the magnetisation times its volume at rest; a `Stiffness` needs an `area`. Magnetised rods
@@ -112,7 +114,12 @@ class Magnets:
             added.append(Magnet(batch_rods, chosen, each))
         self.magnets += added
 
-    def magnetic_field(self, value, gradient=None, origin=(0.0, 0.0, 0.0)) -> None:
+    def magnetic_field(
+        self,
+        value: Vector | Callable[[float], Vector],
+        gradient: Numbers | Callable[[float], Numbers] | None = None,
+        origin: Vector = (0.0, 0.0, 0.0),
+    ) -> None:
         """Apply the magnetic field B = value + gradient (x - origin) to magnetised rods.
 
         The energy of an edge is -V M . B at its midpoint. The field is evaluated at the end of a step of implicit Euler, or the middle
@@ -140,7 +147,7 @@ class Magnets:
         applied.at(0.0, 1.0, SceneError)
         self.applied_field = applied
 
-    def add_dipoles(self, rods=None, cutoff: float | None = None) -> None:
+    def add_dipoles(self, rods: Selection | None = None, cutoff: float | None = None) -> None:
         """Add dipole-dipole interaction of magnetised edges, as point dipoles at their midpoints.
 
         All pairs with midpoints within `cutoff` at rest are listed once, except edges with a common node: n edges have n^2 / 2 pairs

@@ -3,12 +3,14 @@
 from copy import deepcopy
 from dataclasses import dataclass
 from math import pi
+from typing import Literal, TypeAlias
 
 import numpy as np
 
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.scene.law import Law
+from ddg_warp.typing import Floats, Numbers
 
 DRAWN = 1e-3  # displayed radius of rods without one [m]
 
@@ -25,10 +27,10 @@ class Material:
         viscosity: strain-rate damping eta / E [s]: every stiffness k has the viscosity k eta / E.
     """
 
-    young: float
-    poisson: float = 0.5
-    density: float = 1000.0
-    viscosity: float = 0.0
+    young: Numbers
+    poisson: Numbers = 0.5
+    density: Numbers = 1000.0
+    viscosity: Numbers = 0.0
 
     def __post_init__(self):
         _require("Material: young", self.young, "it is positive [Pa]", lambda v: v > 0.0)
@@ -37,7 +39,7 @@ class Material:
         _require("Material: viscosity", self.viscosity, "it is not negative [s]", lambda v: v >= 0.0)
 
     @property
-    def shear(self) -> float:
+    def shear(self) -> float | Floats:
         """Shear modulus G [Pa]."""
         return self.young / (2.0 * (1.0 + self.poisson))
 
@@ -59,15 +61,15 @@ class Stiffness:
         area: of the section [m^2], which a magnetisation needs; 0 if unknown.
     """
 
-    EA: float
-    EI1: float = 0.0
-    EI2: float | None = None
-    GJ: float = 0.0
-    mass_per_length: float = 0.0
-    rotary_inertia: float = 0.0
-    radius: float | None = None
-    viscosity: float = 0.0
-    area: float = 0.0
+    EA: Numbers
+    EI1: Numbers = 0.0
+    EI2: Numbers | None = None
+    GJ: Numbers = 0.0
+    mass_per_length: Numbers = 0.0
+    rotary_inertia: Numbers = 0.0
+    radius: Numbers | None = None
+    viscosity: Numbers = 0.0
+    area: Numbers = 0.0
 
     def stiffness(self, material: Material | None) -> "Stiffness":
         """Return the section itself, with EI2 = EI1 by default; a material is ignored."""
@@ -139,7 +141,7 @@ def _elastic(material: Material, area, i1, i2, torsion) -> Stiffness:
 class Circle:
     """Solid circular section of `radius` [m]; a number, or an array that broadcasts to (rods, edges)."""
 
-    radius: float
+    radius: Numbers
 
     def __post_init__(self):
         _require_sizes(self)
@@ -155,8 +157,8 @@ class Circle:
 class Ellipse:
     """Solid elliptic section with semi-axes a, b [m] along the first and second director."""
 
-    a: float
-    b: float
+    a: Numbers
+    b: Numbers
 
     def __post_init__(self):
         _require_sizes(self)
@@ -173,8 +175,8 @@ class Ellipse:
 class Rectangle:
     """Solid rectangular section, `width` along the first and `height` along the second director [m]."""
 
-    width: float
-    height: float
+    width: Numbers
+    height: Numbers
 
     def __post_init__(self):
         _require_sizes(self)
@@ -204,9 +206,9 @@ class Ribbon:
             (inextensible).
     """
 
-    width: float
-    thickness: float
-    law: str = "audoly_neukirch"
+    width: Numbers
+    thickness: Numbers
+    law: Literal["audoly_neukirch", "sano_wada", "sadowsky"] = "audoly_neukirch"
 
     def __post_init__(self):
         _require_sizes(self, "width", "thickness")
@@ -219,9 +221,12 @@ class Ribbon:
         w, h = np.asarray(self.width, float), np.asarray(self.thickness, float)
         return _elastic(material, w * h, h * w**3 / 12.0, w * h**3 / 12.0, w * h**3 / 3.0)
 
-    def laws(self, material: Material) -> dict:
+    def laws(self, material: Material) -> dict[str, Law]:
         """Return the law of bending and twist, with crossover curvature sqrt(60 / (1 - nu^2)) h / W^2."""
         from ddg_warp.kernels.densities.ribbon import LAWS
 
         crossover = np.sqrt(60.0 / (1.0 - material.poisson**2)) * np.asarray(self.thickness) / np.square(self.width)
         return {"rod_bend_twist": Law(LAWS[self.law], poisson=material.poisson, crossover=crossover)}
+
+
+Section: TypeAlias = Circle | Ellipse | Rectangle | Ribbon | Stiffness

@@ -8,6 +8,7 @@ from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.prescribed_motion import Motion
+from ddg_warp.typing import Floats, Integers, Numbers, Vector
 
 PLANE, BALL, CAPSULE, MESH = "plane", "ball", "capsule", "mesh"
 
@@ -17,9 +18,9 @@ PLANE, BALL, CAPSULE, MESH = "plane", "ball", "capsule", "mesh"
 class Plane:
     """Half-space behind the plane through `point` with outward `normal`."""
 
-    point: tuple = (0.0, 0.0, 0.0)
-    normal: tuple = (0.0, 0.0, 1.0)
-    points: np.ndarray = field(init=False, repr=False, compare=False)
+    point: Vector = (0.0, 0.0, 0.0)
+    normal: Vector = (0.0, 0.0, 1.0)
+    points: Floats = field(init=False, repr=False, compare=False)
 
     kind, radius, cells = PLANE, 0.0, np.array([[0, 1, 2]])
 
@@ -37,7 +38,7 @@ class Plane:
 class Sphere:
     """Ball of a `radius` [m] about `center` [m]."""
 
-    center: tuple
+    center: Vector
     radius: float
 
     kind, cells = BALL, np.array([[0]])
@@ -47,7 +48,7 @@ class Sphere:
         argument_checks.positive("Sphere: radius", self.radius, "m")
 
     @property
-    def points(self) -> np.ndarray:
+    def points(self) -> Floats:
         """Center as an array (1, 3)."""
         return np.array([self.center], float)
 
@@ -57,8 +58,8 @@ class Sphere:
 class Capsule:
     """Points within a `radius` [m] of the segment from `start` to `end` [m]."""
 
-    start: tuple
-    end: tuple
+    start: Vector
+    end: Vector
     radius: float
 
     kind, cells = CAPSULE, np.array([[0, 1]])
@@ -71,7 +72,7 @@ class Capsule:
             raise SceneError("Capsule: start and end are one point; use Sphere(center, radius)")
 
     @property
-    def points(self) -> np.ndarray:
+    def points(self) -> Floats:
         """End points of the axis (2, 3)."""
         return np.array([self.start, self.end], float)
 
@@ -87,8 +88,8 @@ class Mesh:
         radius: half the thickness of the surface [m].
     """
 
-    points: np.ndarray
-    cells: np.ndarray | None = None
+    points: Numbers | tuple[Floats, Integers, str]
+    cells: Numbers | None = None
     radius: float = 0.0
 
     kind = MESH
@@ -119,7 +120,7 @@ CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)
 SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
 
 
-def Box(center, half, rotation=None, radius: float = 0.0) -> Mesh:
+def Box(center: Vector, half: Vector, rotation: Numbers | None = None, radius: float = 0.0) -> Mesh:
     """Return a box about `center` [m] with half lengths `half` (3,) [m], a `rotation` (3, 3), rounded by `radius` [m]."""
     center, half = (np.array(argument_checks.vector(f"Box: {n}", v)) for n, v in (("center", center), ("half", half)))
     if not (half > 0.0).all():

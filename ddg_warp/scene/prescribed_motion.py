@@ -7,6 +7,7 @@ import numpy as np
 
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.typing import Amplitude, Bools, Floats, Integers, Numbers, Vector
 
 LOOKS = 64  # times at which a translation is sampled for moving components
 JUMP = 0.25  # least jump at one instant, over the change of a motion in a step
@@ -38,14 +39,14 @@ class Motion:
         pivot: a point on the axis (3,) [m].
     """
 
-    translation: Callable[[float], tuple] = _still
-    angle: Callable[[float], float] = _unturned
-    axis: tuple = (0.0, 0.0, 1.0)
-    pivot: tuple = (0.0, 0.0, 0.0)
+    translation: Callable[[float], Numbers] = _still
+    angle: Amplitude = _unturned
+    axis: Vector = (0.0, 0.0, 1.0)
+    pivot: Vector = (0.0, 0.0, 0.0)
     count: int | None = field(
         init=False, default=None, repr=False, compare=False
     )  # number of nodes with one displacement each
-    unit: np.ndarray = field(init=False, repr=False, compare=False)
+    unit: Floats = field(init=False, repr=False, compare=False)
 
     def __post_init__(self):
         for name in ("translation", "angle"):
@@ -73,13 +74,13 @@ class Motion:
         """True for a rotation that keeps the plane of x and z."""
         return not self.turns or (self.axis[0] == 0.0 and self.axis[2] == 0.0)
 
-    def moves(self, duration: float) -> np.ndarray:
+    def moves(self, duration: float) -> Bools:
         """Return the moving components of a point (3,), from samples of the translation until `duration`."""
         about = np.abs(self.unit) < 1.0 if self.turns else np.zeros(3, bool)
         times = duration * (np.arange(LOOKS) + 1.0) / LOOKS
         return about | np.any([(self.shift(t) != 0.0).any(0) for t in times], axis=0)
 
-    def shift(self, t: float) -> np.ndarray:
+    def shift(self, t: float) -> Floats:
         """Return translations at t, (1, 3) or (n, 3) [m].
 
         Raises:
@@ -101,7 +102,7 @@ class Motion:
         """
         return float(argument_checks.value_at("the motion's angle", self.angle, t))
 
-    def pose(self, t0: float, t1: float, start: float = 0.0, part: float = 1.0) -> np.ndarray:
+    def pose(self, t0: float, t1: float, start: float = 0.0, part: float = 1.0) -> Floats:
         """Return rows for the device: rotation vector (3), rotation at the start (9), pivot (3), translations (3, 3).
 
         The interval from t0 to t1 is the fraction `part` of the step after the fraction `start`, extrapolated to the whole step. One
@@ -133,17 +134,17 @@ class Motion:
                 t0, low = middle, value
         return t1 if np.abs(high - low).max() > JUMP * whole > 0.0 else None
 
-    def rotation(self, angle: float) -> np.ndarray:
+    def rotation(self, angle: float) -> Floats:
         """Return the rotation matrix about the axis (Rodrigues)."""
         k = self.unit
         cross = np.array([[0.0, -k[2], k[1]], [k[2], 0.0, -k[0]], [-k[1], k[0], 0.0]])
         return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
 
-    def place(self, t: float, points: np.ndarray, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+    def place(self, t: float, points: Floats, rows: Integers | slice = slice(None)) -> Floats:
         """Return points of the rest state (n, 3) moved to t [m]; `rows` select translations given by node."""
         turned = (points - self.pivot) @ self.rotation(self.turned(t)).T
         return turned + self.pivot + self.shift(t)[slice(None) if self.count is None else rows]
 
-    def turn(self, t: float, vectors: np.ndarray) -> np.ndarray:
+    def turn(self, t: float, vectors: Floats) -> Floats:
         """Return vectors of the rest state (n, 3) rotated to t."""
         return vectors @ self.rotation(self.turned(t)).T

@@ -2,10 +2,10 @@
 
 import warnings
 from bisect import bisect_right
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy, deepcopy
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -17,13 +17,15 @@ from ddg_warp.scene.field import Fields
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.handle import LOAD, ROD, SUPPORT, Handle, Handles, need
 from ddg_warp.scene.law import Law, laws_of
-from ddg_warp.scene.material import Material, Stiffness, stiffness_of
+from ddg_warp.scene.material import Material, Section, Stiffness, stiffness_of
 from ddg_warp.scene.prescribed_motion import Motion
 from ddg_warp.scene.shells_and_joints import Structures
 from ddg_warp.scene.user_force import UserForces
+from ddg_warp.typing import Amplitude, Device, End, Integers, Numbers, Precision, Selection, Vector
 
 if TYPE_CHECKING:
     from ddg_warp.model.model import Model
+    from ddg_warp.model.state import State
 
 
 @argument_checks.called
@@ -46,18 +48,18 @@ class Scene(Structures, Fields, UserForces):
         SceneError: an invalid argument; the message names it.
     """
 
-    gravity: tuple = (0.0, 0.0, -9.81)
+    gravity: Vector = (0.0, 0.0, -9.81)
     dimension: int = 3
     analysis: Dynamics | Statics | PathAnalysis = field(default_factory=Dynamics)
     mass_damping: float = 0.0
-    flow: tuple | Callable[[float], tuple] = (0.0, 0.0, 0.0)
-    initial: Callable | None = None
-    callbacks: list[Callable] = field(default_factory=list)
+    flow: Vector | Callable[[float], Vector] = (0.0, 0.0, 0.0)
+    initial: "Callable[[Model], State] | None" = None
+    callbacks: "list[Callable[[State], object]]" = field(default_factory=list)
     batches: list[RodBatch] = field(default_factory=list, init=False)
     supports: list[Support] = field(default_factory=list, init=False)
     loads: list[Load] = field(default_factory=list, init=False)
-    masses: list[tuple[np.ndarray, int, float]] = field(default_factory=list, init=False)
-    drags: list[tuple[np.ndarray, object]] = field(default_factory=list, init=False)
+    masses: list[tuple[Integers, int, float]] = field(default_factory=list, init=False)
+    drags: list[tuple[Integers, object]] = field(default_factory=list, init=False)
 
     def __post_init__(self):
         validate.check_settings(self)
@@ -95,18 +97,18 @@ class Scene(Structures, Fields, UserForces):
 
     def add_rod(
         self,
-        points,
+        points: Numbers | Sequence[Numbers],
         *,
-        section,
+        section: Section,
         material: Material | None = None,
         closed: bool = False,
-        natural="shape",
-        director=None,
+        natural: Literal["shape", "straight"] | Numbers = "shape",
+        director: Numbers | None = None,
         twist: bool = True,
         bend: bool = True,
         name: str = "rod",
         laws: Mapping[str, Law] | None = None,
-        curvature: str = "tangent",
+        curvature: Literal["tangent", "angle"] = "tangent",
     ) -> Handle:
         """Add one rod with points (n, 3) and return its handle; arguments as in `add_rods`, a director (3,) or (edges, 3)."""
         if director is not None:
@@ -118,18 +120,18 @@ class Scene(Structures, Fields, UserForces):
 
     def add_rods(
         self,
-        points,
+        points: Numbers | Sequence[Numbers],
         *,
-        section,
+        section: Section,
         material: Material | None = None,
         closed: bool = False,
-        natural="shape",
-        director=None,
+        natural: Literal["shape", "straight"] | Numbers = "shape",
+        director: Numbers | None = None,
         twist: bool = True,
         bend: bool = True,
         name: str = "rod",
         laws: Mapping[str, Law] | None = None,
-        curvature: str = "tangent",
+        curvature: Literal["tangent", "angle"] = "tangent",
     ) -> Handles:
         """Add rods.
 
@@ -228,7 +230,9 @@ class Scene(Structures, Fields, UserForces):
             raise
         return Handles(range(first, self.rod_count), options["name"])
 
-    def clamp(self, rods, edges=(0,), motion: Motion | Grip | None = None, name: str = "") -> Handle:
+    def clamp(
+        self, rods: Selection, edges: Selection = (0,), motion: Motion | Grip | None = None, name: str = ""
+    ) -> Handle:
         """Clamp edges: fix both nodes and the twist angle. The continuum clamp then lies at the middle of the edge.
 
         Negative indices count from the last edge; a mask of bools or a slice is accepted, too. `motion` prescribes the edges; by
@@ -240,12 +244,12 @@ class Scene(Structures, Fields, UserForces):
 
     def clamp_end(
         self,
-        rods,
-        end: str = "first",
+        rods: Selection,
+        end: End = "first",
         motion: Motion | Grip | None = None,
         components: str = "xyz",
-        tangent=None,
-        director=None,
+        tangent: Numbers | None = None,
+        director: Numbers | None = None,
         name: str = "",
     ) -> Handle:
         """Fix position and frame exactly at an end node, with the tangent prescribed at the node and an end cell of half size.
@@ -284,30 +288,41 @@ class Scene(Structures, Fields, UserForces):
         options = {"components": components, "end": end, "tangent": tangent, "director": director}
         return self._support("clamp_end", rods, motion=motion, name=name, **options)
 
-    def fix(self, rods, nodes, components: str = "xyz", motion: Motion | Grip | None = None, name: str = "") -> Handle:
+    def fix(
+        self,
+        rods: Selection,
+        nodes: Selection,
+        components: str = "xyz",
+        motion: Motion | Grip | None = None,
+        name: str = "",
+    ) -> Handle:
         """Fix components of nodes (a hinge). A motion may give a displacement for every node."""
         rods, nodes = self._on_rods("fix", rods, "node", nodes)
         return self._support("fix", rods, nodes=nodes, components=components, motion=motion, name=name)
 
-    def fix_twist(self, rods, edges, motion: Motion | Grip | None = None, name: str = "") -> Handle:
+    def fix_twist(
+        self, rods: Selection, edges: Selection, motion: Motion | Grip | None = None, name: str = ""
+    ) -> Handle:
         """Fix the twist angle of edges."""
         rods, edges = self._on_rods("fix_twist", rods, "edge", edges)
         self._need_twist("fix_twist", rods)
         return self._support("fix_twist", rods, edges=edges, motion=motion, name=name)
 
-    def add_force(self, rods, node: int, force, amplitude: Callable[[float], float] | None = None) -> Handle:
+    def add_force(self, rods: Selection, node: int, force: Vector, amplitude: Amplitude | None = None) -> Handle:
         """Add a dead force [N] on a node, times amplitude(t). In statics it grows with the load parameter if amplitude is None."""
         force = argument_checks.vector(f"add_force: force on node {node}", force)
         self._in_plane("add_force: force", force, (1,))
         return self._load("add_force", rods, "node", node, amplitude, force=force)
 
-    def add_twisting_moment(self, rods, edge: int, moment: float, amplitude=None) -> Handle:
+    def add_twisting_moment(
+        self, rods: Selection, edge: int, moment: float, amplitude: Amplitude | None = None
+    ) -> Handle:
         """Add a moment [N m] about the tangent of an edge, conjugate to the twist angle."""
         self._need_twist("add_twisting_moment", self._rods(rods))
         moment = argument_checks.number(f"add_twisting_moment: moment on edge {edge}", moment)
         return self._load("add_twisting_moment", rods, "edge", edge, amplitude, moment=moment)
 
-    def add_couple(self, rods, edge: int, couple, amplitude=None) -> Handle:
+    def add_couple(self, rods: Selection, edge: int, couple: Vector, amplitude: Amplitude | None = None) -> Handle:
         """Add a couple (3,) [N m] on an edge with axis fixed in space: a pair of forces across the edge and a moment about it.
 
         Out of plane it has no potential (Ziegler, Principles of Structural Stability, 1968). Statics treats it exactly; in
@@ -317,14 +332,23 @@ class Scene(Structures, Fields, UserForces):
         self._in_plane("add_couple: couple", couple, (0, 2))
         return self._load("add_couple", rods, "edge", edge, amplitude, couple=couple)
 
-    def add_mass(self, rods, node: int, mass: float) -> None:
+    def add_mass(self, rods: Selection, node: int, mass: float) -> None:
         """Add a point mass [kg] on a node."""
         rods = argument_checks.once("add_mass: rods", self._rods(rods))
         rods, (node,) = self._on_rods("add_mass", rods, "node", argument_checks.index("add_mass: node", node))
         mass = argument_checks.positive(f"add_mass: mass at node {node}", mass, "kg")
         self.masses.append((rods, node, mass))
 
-    def drag(self, rods=None, law=None, *, tangential=None, normal=None, rotational=0.0, nodes=None) -> None:
+    def drag(
+        self,
+        rods: Selection | None = None,
+        law: drag.Viscous | drag.Granular | None = None,
+        *,
+        tangential: Numbers | None = None,
+        normal: Numbers | None = None,
+        rotational: Numbers = 0.0,
+        nodes: Numbers | None = None,
+    ) -> None:
         """Add anisotropic drag of a fluid or granular medium on rods against `flow` (resistive force theory).
 
         Drag does not act in statics, continuation and spectra. In a time step it is implicit, with time-lagged tangents of the start
@@ -353,7 +377,7 @@ class Scene(Structures, Fields, UserForces):
         self.drags.append(drag.rod_drag(self.batches, rods, law, tangential, normal, rotational, nodes))
 
     def build(
-        self, device=None, precision: str | None = None, worlds: int = 1, allow_rounding: bool = False
+        self, device: Device = None, precision: Precision | None = None, worlds: int = 1, allow_rounding: bool = False
     ) -> "Model":
         """Compile the current scene into a `Model` on a device.
 
@@ -377,7 +401,7 @@ class Scene(Structures, Fields, UserForces):
         refuse_underflow(model)
         return model
 
-    def copy(self, **changes) -> "Scene":
+    def copy(self, **changes: object) -> "Scene":
         """Return a copy of the scene with changed attributes; lists and entries are copied, arrays are not."""
         for name in changes:
             self._need_attribute(name)

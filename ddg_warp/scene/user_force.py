@@ -2,12 +2,15 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
 
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
+from ddg_warp.typing import Floats, Integers, Numbers, Selection
 
+WarpFunction: TypeAlias = Callable[[type], object]  # scalar type -> function decorated by `wp.func`
 SIGNATURES = {False: ("x", "v", "t", "p"), True: ("d", "p", "q")}
 
 
@@ -24,12 +27,12 @@ class UserForce:
     """
 
     name: str
-    function: Callable
-    potential: Callable | None
+    function: WarpFunction
+    potential: WarpFunction | None
     pairs: bool
-    rods: list[tuple[int, np.ndarray]]
-    shells: list[tuple[int, np.ndarray]]
-    parameters: dict[str, np.ndarray]
+    rods: list[tuple[int, Integers]]
+    shells: list[tuple[int, Integers]]
+    parameters: dict[str, Floats]
 
     @property
     def count(self) -> int:
@@ -52,14 +55,14 @@ class UserForces:
     def add_nodal_force(
         self,
         name: str,
-        function: Callable,
+        function: WarpFunction,
         *,
-        parameters: Mapping | None = None,
-        potential: Callable | None = None,
-        rods=None,
-        nodes=None,
-        shells=None,
-        vertices=None,
+        parameters: Mapping[str, Numbers] | None = None,
+        potential: WarpFunction | None = None,
+        rods: Selection | None = None,
+        nodes: Selection | None = None,
+        shells: Selection | None = None,
+        vertices: Selection | None = None,
     ) -> None:
         """Add a user-defined force on nodes, evaluated with its derivatives in every iteration of steps and equilibria.
 
@@ -84,14 +87,14 @@ class UserForces:
     def add_pair_force(
         self,
         name: str,
-        function: Callable,
+        function: WarpFunction,
         *,
-        parameters: Mapping | None = None,
-        potential: Callable | None = None,
-        rods=None,
-        nodes=None,
-        shells=None,
-        vertices=None,
+        parameters: Mapping[str, Numbers] | None = None,
+        potential: WarpFunction | None = None,
+        rods: Selection | None = None,
+        nodes: Selection | None = None,
+        shells: Selection | None = None,
+        vertices: Selection | None = None,
     ) -> None:
         """Add a user-defined force between all pairs of nodes, such as gravity or electrostatics.
 

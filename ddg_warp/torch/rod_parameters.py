@@ -1,5 +1,7 @@
 """Module of learned rod material and section parameters."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 import warp as wp
@@ -8,6 +10,7 @@ from ddg_warp.errors import SceneError
 from ddg_warp.scene import edge_forces
 from ddg_warp.torch import contact_parameters, named_parameters
 from ddg_warp.torch.positive_parameters import parameter_key, requested, usual_values
+from ddg_warp.torch.simulator import Simulator
 
 NAMES = ("stretching", "bending", "twisting", "density", "radius")
 LAWS = {f"{laws.name}.{name}": (laws, name) for laws in edge_forces.LAWS for name in laws.radius_powers}
@@ -37,7 +40,10 @@ class RodParameters(torch.nn.Module):
     """
 
     def __init__(
-        self, simulator, batch: int | None = None, names: tuple[str, ...] = ("stretching", "bending", "twisting")
+        self,
+        simulator: Simulator,
+        batch: int | None = None,
+        names: Sequence[str] = ("stretching", "bending", "twisting"),
     ):
         super().__init__()
         names, batch = requested("RodParameters", simulator, names, batch)

@@ -1,6 +1,8 @@
 """Module of learned shell materials and rest shapes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -13,6 +15,8 @@ from ddg_warp.model.rest_shapes import edges_along
 from ddg_warp.torch import contact_parameters
 from ddg_warp.torch.parameter_storage import meeting
 from ddg_warp.torch.positive_parameters import parameter_key, requested, usual_values
+from ddg_warp.torch.simulator import Simulator
+from ddg_warp.typing import Numbers, Selection
 
 STIFF, HEAVY = ("young", "thickness", "poisson"), ("density", "thickness")  # quantities in stiffnesses and in masses
 NUMBERS, FORMS = (*STIFF, "density"), ("metric", "curvature")  # quantities with one component and with three
@@ -63,13 +67,13 @@ class ShellParameters(torch.nn.Module):
 
     def __init__(
         self,
-        simulator,
-        names=("young",),
+        simulator: Simulator,
+        names: Sequence[str] = ("young",),
         *,
-        shells=None,
-        by="shell",
+        shells: Selection | None = None,
+        by: Literal["shell", "element"] | Numbers = "shell",
         batch: int | None = None,
-        direction=(1.0, 0.0, 0.0),
+        direction: Numbers = (1.0, 0.0, 0.0),
     ):
         super().__init__()
         names, batch = requested("ShellParameters", simulator, names, batch)

@@ -1,8 +1,9 @@
 """Simulator: a model as a torch module of pure functions from states to states."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -13,18 +14,24 @@ from ddg_warp.adjoint.implicit import refuse_gyroscopic
 from ddg_warp.capture_lock import alone
 from ddg_warp.errors import GradientWarning, SceneError
 from ddg_warp.model.controls import Controls, named_field, require_acting, shapes
-from ddg_warp.model.model import check_model
-from ddg_warp.model.state import check_state
+from ddg_warp.model.model import Model, check_model
+from ddg_warp.model.state import State, check_state
 from ddg_warp.solve.equilibrium import statics
 from ddg_warp.solve.newton.rod_newton import NewtonOptions
 from ddg_warp.solve.stepping.integrator import SCHEMES, Integrator
 from ddg_warp.torch.autograd import Balance, Call, Step
+from ddg_warp.torch.compiler import graph_break
 from ddg_warp.torch.controls import FIELD
 from ddg_warp.torch.engine import LOAD, Engine
 from ddg_warp.torch.rollout import Plan, bytes_of, plan, roll
 from ddg_warp.torch.state_layout import copies, tensors
 from ddg_warp.torch.world_state import WorldState, outcome_names, require_same
 from ddg_warp.torch.wrenches import Wrenches, WrenchTensors
+from ddg_warp.typing import Names, Numbers, Option, Scheme
+
+Tensors: TypeAlias = torch.Tensor | Numbers
+Parameters: TypeAlias = Mapping[str, Tensors]  # by name, as of `Model.set_parameter`
+Inputs: TypeAlias = Mapping[str, Tensors | Mapping[str, Tensors]]  # controls by name
 
 SETTLED = {"failures", "check_every", "energy_bound"}  # arguments of `Integrator` that the engine sets
 
@@ -61,7 +68,7 @@ class Simulator(torch.nn.Module):
         SceneError: the model has a feature without gradients, once one is requested.
     """
 
-    def __init__(self, model, dt: float, *, scheme: str = "implicit_euler", **options):
+    def __init__(self, model: Model, dt: float, *, scheme: Scheme = "implicit_euler", **options: Option):
         super().__init__()
         check_model("Simulator", model)
         argument_checks.choice("scheme", scheme, SCHEMES)
@@ -114,8 +121,10 @@ class Simulator(torch.nn.Module):
     def __deepcopy__(self, memo):
         return type(self)(self.model, self.dt, scheme=self.scheme, **self.options)
 
-    @torch.compiler.disable
-    def initial_state(self, batch: int | None = None, positions=None, velocities=None) -> WorldState:
+    @graph_break
+    def initial_state(
+        self, batch: int | None = None, positions: Tensors | None = None, velocities: Tensors | None = None
+    ) -> WorldState:
         """Return the first state of all worlds, at rest or with given positions and velocities.
 
         Args:
@@ -145,7 +154,7 @@ class Simulator(torch.nn.Module):
         engine.check(values)
         return WorldState.begun(values, 0.0, engine)
 
-    def world_state(self, state) -> WorldState:
+    def world_state(self, state: State | WorldState) -> WorldState:
         """Convert a `State`, such as `model.state(points, velocities)` or a checkpoint, to a start state; gradients begin there.
 
         Unlike in `initial_state`, frames and the last strains of damping are taken from the state, not from rest. A `WorldState` that
@@ -179,8 +188,10 @@ class Simulator(torch.nn.Module):
         codes = state.codes.to(engine.device)
         return WorldState(tuple(values), state.time, engine, codes, torch.ones_like(codes, dtype=torch.bool))
 
-    @torch.compiler.disable  # a graph break: the compiler cannot trace Warp launches
-    def step(self, state: WorldState, parameters: dict | None = None, controls: dict | None = None) -> WorldState:
+    @graph_break
+    def step(
+        self, state: WorldState, parameters: Parameters | None = None, controls: Inputs | None = None
+    ) -> WorldState:
         """Return the state after a step of dt.
 
         Raises:
@@ -191,9 +202,13 @@ class Simulator(torch.nn.Module):
 
     forward = step
 
-    @torch.compiler.disable
+    @graph_break
     def wrenches(
-        self, before: WorldState, after: WorldState, parameters: dict | None = None, controls: dict | None = None
+        self,
+        before: WorldState,
+        after: WorldState,
+        parameters: Parameters | None = None,
+        controls: Inputs | None = None,
     ) -> WrenchTensors:
         """Return the wrenches of supports and grips in the step from `before` to `after`, with gradients by all arguments.
 
@@ -215,12 +230,12 @@ class Simulator(torch.nn.Module):
                 engine.tables.write(tuple(name for name, _ in full), [value for _, group in full for value in group])
             return engine.wrenches(before, after, full, controls, self.dt)
 
-    @torch.compiler.disable
+    @graph_break
     def rollout(
         self,
         state: WorldState,
-        parameters: dict | None = None,
-        controls=None,
+        parameters: Parameters | None = None,
+        controls: Inputs | Callable[[int], Inputs] | None = None,
         *,
         steps: int,
         save: int = 1,
@@ -260,7 +275,7 @@ class Simulator(torch.nn.Module):
     def plan(
         self,
         state: WorldState,
-        controls: dict | None = None,
+        controls: Inputs | Callable[[int], Inputs] | None = None,
         *,
         steps: int,
         save: int = 1,
@@ -294,15 +309,15 @@ class Simulator(torch.nn.Module):
             bytes_of(state.values) + other_bytes, steps * shared if several else shared, steps, save, every, memory
         )
 
-    @torch.compiler.disable
+    @graph_break
     def equilibrium(
         self,
-        parameters: dict | None = None,
-        controls: dict | None = None,
+        parameters: Parameters | None = None,
+        controls: Inputs | None = None,
         *,
         state: WorldState | None = None,
         batch: int | None = None,
-        **options,
+        **options: Option,
     ) -> WorldState:
         """Return the equilibrium of every world, with gradients by parameters and controls.
 
@@ -341,7 +356,7 @@ class Simulator(torch.nn.Module):
         results = Balance.apply(call, tuple(options.items()), *(value.detach() for value in state.values), *values)
         return WorldState.begun(results[: len(engine.fields)], end, engine)
 
-    def outcomes(self) -> np.ndarray:
+    def outcomes(self) -> Names:
         """Return outcomes of the last step of every world in the batch stepped last (B,); see `WorldState.outcomes`.
 
         Raises:

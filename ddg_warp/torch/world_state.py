@@ -1,5 +1,6 @@
 """WorldState: the states of the worlds of a batch as tensors."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import warp as wp
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core import outcome
+from ddg_warp.torch.compiler import graph_break
 from ddg_warp.torch.engine import Engine
 from ddg_warp.torch.state_layout import StateLayout
 
@@ -27,14 +29,14 @@ class WorldState:
             values computed from failed worlds.
     """
 
-    values: tuple
+    values: tuple[torch.Tensor, ...]
     time: float
     engine: Engine | None
     codes: torch.Tensor
     differentiable: torch.Tensor
 
     @classmethod
-    def begun(cls, values, time: float, engine: Engine) -> "WorldState":
+    def begun(cls, values: Iterable[torch.Tensor], time: float, engine: Engine) -> "WorldState":
         """Return a state without a step before."""
         codes = torch.zeros(engine.model.worlds, dtype=torch.int32, device=engine.device)
         return cls(tuple(values), time, engine, codes, codes == 0)
@@ -53,19 +55,19 @@ class WorldState:
         return self.engine.layout
 
     @property
-    @torch.compiler.disable
+    @graph_break
     def positions(self) -> torch.Tensor:
         """Points (B, P, 3) [m], in the order of `State.points`."""
         return self.layout.points(self.values, "x", "q")
 
     @property
-    @torch.compiler.disable
+    @graph_break
     def velocities(self) -> torch.Tensor:
         """Velocities of points (B, P, 3) [m/s]."""
         return self.layout.points(self.values, "v", "v")
 
     @property
-    @torch.compiler.disable
+    @graph_break
     def angles(self) -> torch.Tensor:
         """Twist angles of edges (B, edges) [rad], zero without twist."""
         return self.layout.edges(self.values)

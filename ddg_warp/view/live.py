@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,14 +12,18 @@ from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.model.controls import Controls
 from ddg_warp.model.masses import point_masses
-from ddg_warp.model.model import check_model
-from ddg_warp.model.state import check_state
+from ddg_warp.model.model import Model, check_model
+from ddg_warp.model.state import State, check_state
+from ddg_warp.typing import FilePath
 from ddg_warp.view.drawing import Drawing, Frame, largest_force, legend, value_range
 from ddg_warp.view.handles import Grips, Springs
 from ddg_warp.view.parameter_slider import ParameterSlider, adjustable
 from ddg_warp.view.recording import NO_FIELD
 from ddg_warp.view.stage import PORT, Stage
 from ddg_warp.view.states import fields_of, frame_of
+
+if TYPE_CHECKING:
+    from viser import GuiInputHandle
 
 FRAME_RATE = 30.0  # drawn states a second at most [1/s]
 KEPT = 400  # frames that `save` writes at most; with more every second one is dropped
@@ -47,7 +52,9 @@ class Viewer:
         DataError: The package viser is missing.
     """
 
-    def __init__(self, model, *, port: int = PORT, host: str = "127.0.0.1", paused: bool = False, pace: float = 1.0):
+    def __init__(
+        self, model: Model, *, port: int = PORT, host: str = "127.0.0.1", paused: bool = False, pace: float = 1.0
+    ):
         check_model("Viewer", model)
         argument_checks.flag("Viewer: paused", paused)
         argument_checks.number("Viewer: pace", pace, "a number from 0 on", lambda value: value >= 0.0)
@@ -90,7 +97,7 @@ class Viewer:
             gui.add_button("add slider").on_click(lambda _: self._wanted.append(chosen.value))
             self._folder = gui.add_folder("sliders")
 
-    def slider(self, name: str, low: float | None = None, high: float | None = None):
+    def slider(self, name: str, low: float | None = None, high: float | None = None) -> GuiInputHandle[float]:
         """Add a slider for a parameter; return its viser handle.
 
         Args:
@@ -126,7 +133,7 @@ class Viewer:
             changes["poses"] = poses
         return replace(controls, **changes)
 
-    def show(self, state):
+    def show(self, state: State) -> State:
         """Show a state, wait while the loop is paused, and return the state to go on from.
 
         States of less than 1/30 s of wall time after the last are not drawn. The returned state is the given one, or after a reset
@@ -157,7 +164,7 @@ class Viewer:
         self._frames.clear()
         return self.show(self._first.copy())
 
-    def save(self, path, seconds: float = 1.0 / FRAME_RATE, title: str = "") -> None:
+    def save(self, path: FilePath, seconds: float = 1.0 / FRAME_RATE, title: str = "") -> None:
         """Write the shown states as FILE.viser, or as FILE.html, a page that plays without Python.
 
         Args:

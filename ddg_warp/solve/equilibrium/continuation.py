@@ -22,6 +22,7 @@ from scipy.optimize import brentq
 from ddg_warp import argument_checks
 from ddg_warp.capture_lock import launches, stays_here
 from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.model.model import Model
 from ddg_warp.model.state import State, check_state
 from ddg_warp.progress import Heartbeat
 from ddg_warp.scene.equilibrium_path import (
@@ -34,6 +35,7 @@ from ddg_warp.scene.equilibrium_path import (
     watched_displacements,
 )
 from ddg_warp.solve.equilibrium.arc_length_corrector import ContinuationOptions, Corrector, Failed
+from ddg_warp.typing import Numbers, Option
 
 FORK = 1e-2  # Relative work of the load along the path below which a stationary load is no limit point.
 CONTROLLED = 0.2  # Largest deviation of a controlled change from the mean of the end rates, relative.
@@ -56,7 +58,9 @@ class Continuation:
         SceneError: no supports, several worlds, or a watched point that does not exist.
     """
 
-    def __init__(self, model, watch: Mapping[str, Displacement | tuple[int | str, int]] | None = None, **options):
+    def __init__(
+        self, model: Model, watch: Mapping[str, Displacement | tuple[int | str, int]] | None = None, **options: Option
+    ):
         planar = getattr(getattr(model, "scene", None), "dimension", 3) == 2
         watch = watched_displacements("Continuation", {} if watch is None else watch, planar)
         self.model = model
@@ -114,7 +118,7 @@ class Continuation:
             raise SceneError(f"stop at {name!r}: it is not watched{argument_checks.meant(name, self.watched)}")
         return stop or StopCriterion()
 
-    def statistics(self, points: Sequence[Point]) -> dict:
+    def statistics(self, points: Sequence[Point]) -> dict[str, object]:
         """Return contact statistics under "contact", of these points and all earlier points.
 
         See `CoupledEquilibrium.contact_statistics`.
@@ -175,7 +179,7 @@ class Continuation:
     def control(
         self,
         displacement: str,
-        values: Sequence[float],
+        values: Numbers,
         state: State | None = None,
         *,
         start: float = 0.0,

@@ -3,8 +3,10 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 from scipy import linalg, sparse
 from scipy.optimize import brentq
 from scipy.sparse.linalg import LinearOperator, eigs, splu
@@ -12,12 +14,13 @@ from scipy.sparse.linalg import LinearOperator, eigs, splu
 from ddg_warp import argument_checks
 from ddg_warp.compile.precision import lost_in_rounding
 from ddg_warp.errors import SceneError
-from ddg_warp.model.model import check_model
-from ddg_warp.model.state import query
+from ddg_warp.model.model import Model, check_model
+from ddg_warp.model.state import State, query
 from ddg_warp.solve.equilibrium.rigid_modes import rigid_modes
 from ddg_warp.solve.equilibrium.tangent import Tangent
 from ddg_warp.solve.linear.eigensolver import LowestFactors, ShiftInvertLanczos, dense
 from ddg_warp.solve.linear.sparse_direct import Factorisation, SingularError, pinned, regular
+from ddg_warp.typing import Complexes, Floats
 
 NEGATIVE = 64.0  # curvature over the sum of magnitudes of its terms that may be zero, in rounding units
 DENSE = 600  # free dofs up to which a dense eigenvalue solver is faster and safer
@@ -39,11 +42,11 @@ class Spectrum:
             (number, worlds, P, 3).
     """
 
-    eigenvalues: np.ndarray
-    modes: np.ndarray
+    eigenvalues: Complexes
+    modes: Complexes
     negative: int
     rigid: int = 0
-    displacements: np.ndarray | None = None
+    displacements: Complexes | None = None
 
     @property
     def stable(self) -> bool:
@@ -51,19 +54,24 @@ class Spectrum:
         return self.negative == 0 and not np.iscomplexobj(self.eigenvalues)
 
     @property
-    def elastic(self) -> np.ndarray:
+    def elastic(self) -> Complexes:
         """Eigenvalues without rigid modes."""
         return np.delete(self.eigenvalues, np.flatnonzero(self.eigenvalues == 0.0)[: self.rigid])
 
     @property
-    def frequencies(self) -> np.ndarray:
+    def frequencies(self) -> Complexes:
         """Angular frequencies [rad/s]: 0 for rigid modes, NaN for negative eigenvalues, complex for flutter."""
         with np.errstate(invalid="ignore"):
             return np.sqrt(self.eigenvalues)
 
 
 def spectrum(
-    model, state, count: int = 4, metric: str = "mass", tangent: Tangent | None = None, load: float | None = None
+    model: Model,
+    state: State,
+    count: int = 4,
+    metric: Literal["mass", "unit"] = "mass",
+    tangent: Tangent | None = None,
+    load: float | None = None,
 ) -> Spectrum:
     """Return the `count` lowest eigenvalues of the constrained tangent at a state.
 
@@ -119,7 +127,7 @@ def spectrum(
     return Spectrum(values[:count], full, negative, zero, displacements)
 
 
-def negative_eigenvalues(matrix) -> int:
+def negative_eigenvalues(matrix: sparse.csc_matrix) -> int:
     """Return the number of eigenvalues of a stiffness with negative real part.
 
     Exactly zero eigenvalues do not count. Follower loads make the stiffness unsymmetric.
@@ -135,7 +143,7 @@ def negative_eigenvalues(matrix) -> int:
     return int((values < 0.0).sum())
 
 
-def instabilities(tangent: Tangent, state, stiffness: sparse.csc_matrix) -> int:
+def instabilities(tangent: Tangent, state: State, stiffness: sparse.csc_matrix) -> int:
     """Return the inertia count of the tangent stiffness (size, size) on free dofs, without rigid modes."""
     free = np.flatnonzero(tangent.free)
     matrix = sparse.csc_matrix(stiffness[free][:, free])
@@ -156,16 +164,16 @@ class IslandStability:
         modes: lowest modes of unstable islands (size,), of arbitrary length; zero in others.
     """
 
-    stable: np.ndarray
-    modes: np.ndarray
+    stable: npt.NDArray[np.object_]  # True, False or None
+    modes: Floats
 
-    def by_world(self, tangent: Tangent) -> tuple:
+    def by_world(self, tangent: Tangent) -> tuple[bool | None, ...]:
         """Return the stability of each world: False if an island is unstable, None if one is unknown, else True."""
         of_worlds = (self.stable[tangent.world == world] for world in range(tangent.model.worlds))
         return tuple(False if False in values else None if None in values else True for values in map(list, of_worlds))
 
 
-def of_islands(tangent: Tangent, state, stiffness: sparse.csc_matrix) -> IslandStability:
+def of_islands(tangent: Tangent, state: State, stiffness: sparse.csc_matrix) -> IslandStability:
     """Return the stability of every island by the tangent stiffness (size, size)."""
     stable, modes = np.full(tangent.islands, None, object), np.zeros(tangent.size)
     free = np.flatnonzero(tangent.free)
@@ -203,7 +211,7 @@ def _lowest_mode(matrix: sparse.csc_matrix, weights: np.ndarray, zero_modes: np.
     return mode * np.sign(mode[np.argmax(np.abs(mode))])
 
 
-def is_symmetric(matrix) -> bool:
+def is_symmetric(matrix: sparse.csc_matrix) -> bool:
     """Return True if a stiffness is symmetric to rounding, so that the loads have a potential."""
     return bool(abs(matrix - matrix.T).max() <= 1e-11 * abs(matrix).max())
 
@@ -246,7 +254,7 @@ def _unsymmetric(matrix, weights: np.ndarray, count: int) -> tuple[np.ndarray, n
     return values, modes
 
 
-def nearest_to_zero(matrix, scaling: np.ndarray) -> tuple[float, np.ndarray]:
+def nearest_to_zero(matrix: sparse.csc_matrix, scaling: Floats) -> tuple[float, Floats]:
     """Return the eigenvalue nearest to zero of S K S, S = diag(scaling), and S times its eigenvector.
 
     Inverse iteration; the matrix may be unsymmetric. The largest entry of the vector is positive, for reproducibility.
@@ -268,7 +276,9 @@ def nearest_to_zero(matrix, scaling: np.ndarray) -> tuple[float, np.ndarray]:
     return value, vector * np.sign(vector[np.argmax(np.abs(vector))])
 
 
-def critical(equilibrium_at: Callable, low: float, high: float, tolerance: float = 1e-8) -> float:
+def critical(
+    equilibrium_at: Callable[[float], tuple[Model, State]], low: float, high: float, tolerance: float = 1e-8
+) -> float:
     """Return the critical parameter between low and high, a root of the lowest nonrigid eigenvalue.
 
     Args:
@@ -315,7 +325,7 @@ def critical(equilibrium_at: Callable, low: float, high: float, tolerance: float
     return float(brentq(lowest, low, high, xtol=tolerance * abs(high - low)))
 
 
-def buckling(model, free, loaded, count: int = 1) -> np.ndarray:
+def buckling(model: Model, free: State, loaded: State, count: int = 1) -> Floats:
     """Return the linearised buckling factors: the lowest positive f with K(free) + f (K(loaded) - K(free)) singular.
 
     K are the exact tangents of two equilibria, follower loads included; the first one is stable. If the state before buckling is
@@ -354,7 +364,9 @@ def buckling(model, free, loaded, count: int = 1) -> np.ndarray:
     return factor
 
 
-def lowest_factors(matrix, softening, factors: Factorisation, count: int) -> np.ndarray:
+def lowest_factors(
+    matrix: sparse.csc_matrix, softening: sparse.csc_matrix, factors: Factorisation, count: int
+) -> Floats:
     """Return the `count` lowest positive f with det(K - f S) = 0, or all if fewer; `factors` of a positive definite K."""
     if matrix.shape[0] > DENSE:
         return LowestFactors(matrix, softening, factors)(count)

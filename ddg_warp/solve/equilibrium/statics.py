@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from ddg_warp.compile.precision import lost_in_rounding
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.model import validate
 from ddg_warp.model.controls import Controls, checked
-from ddg_warp.model.model import check_model
+from ddg_warp.model.model import Model, check_model
 from ddg_warp.model.state import State, check_state
 from ddg_warp.progress import Heartbeat
 from ddg_warp.scene import validate as scene_validate
@@ -40,6 +41,9 @@ from ddg_warp.solve.equilibrium.support_checks import adrift, require_supports, 
 from ddg_warp.solve.equilibrium.tangent import Tangent
 from ddg_warp.solve.forces.prescribed_motion import jump_between, poses_between
 from ddg_warp.solve.linear.solver_selection import large_static, static_solver, why_not_pcg
+from ddg_warp.typing import Bools, Floats, Numbers, Option
+
+RestShapes: TypeAlias = Mapping[int | str, Mapping[str, Numbers]]  # shell or rod -> form -> values
 
 SOLVERS = ("auto", "direct", "pcg")
 DESCENTS = 8  # descents from saddles in one solve
@@ -72,9 +76,9 @@ class StaticsOptions:
     floor_factor: float = 16.0
     max_iterations: int = 100
     rotation_cap: float = 0.5
-    mode: str = "minimise"
+    mode: Literal["minimise", "follow"] = "minimise"
     max_cuts: int = 10
-    solver: str = "auto"
+    solver: Literal["auto", "direct", "pcg"] = "auto"
 
     def __post_init__(self):
         argument_checks.check_options(self, ("rtol", "floor_factor", "rotation_cap"), ("max_iterations", "max_cuts"))
@@ -88,7 +92,7 @@ class StaticsOptions:
 
 
 def solve(
-    model,
+    model: Model,
     state: State | None = None,
     *,
     controls: Controls | None = None,
@@ -96,9 +100,9 @@ def solve(
     start: float = 0.0,
     end: float = 1.0,
     way: list[State] | None = None,
-    rest: Mapping | None = None,
+    rest: RestShapes | None = None,
     progress: bool = True,
-    **options,
+    **options: Option,
 ) -> State:
     """Return the equilibrium at load parameter `end`, reached from `start` in at least `load_steps` increments.
 
@@ -165,7 +169,7 @@ class Equilibrium:
         stiffness: tangent at the last equilibrium (size, size), None without `factors`.
     """
 
-    def __init__(self, model, options: StaticsOptions | None = None):
+    def __init__(self, model: Model, options: StaticsOptions | None = None):
         self.model, self.options = model, options or StaticsOptions()
         self.tangent = Tangent(model)
         rounding = self.options.floor_factor * model.types.eps
@@ -226,7 +230,7 @@ class Equilibrium:
         end: float = 1.0,
         controls: Controls | None = None,
         way: list[State] | None = None,
-        rest: Mapping | None = None,
+        rest: RestShapes | None = None,
     ) -> State:
         """Run load stepping; see `solve`."""
         for name, value in (("start", start), ("end", end)):
@@ -343,7 +347,7 @@ class Equilibrium:
         if self.model.touch:
             self.coupled.count(state, increment)
 
-    def statistics(self) -> dict:
+    def statistics(self) -> dict[str, object]:
         """Return contact statistics of the counted equilibria under "contact"; `load` counts.
 
         See `CoupledEquilibrium.contact_statistics`.
@@ -454,9 +458,7 @@ class Equilibrium:
             length = np.where(left, length, 0.5 * length)
         return moved_by(np.where(left, length, 0.0)), left
 
-    def found(
-        self, state: State, outer: np.ndarray, residual: np.ndarray, load_factor: float, small: np.ndarray
-    ) -> State:
+    def found(self, state: State, outer: Floats, residual: Floats, load_factor: float, small: Bools) -> State:
         """Return the state as the equilibrium at a load parameter, with outcome and unbalanced loads.
 
         Args:
