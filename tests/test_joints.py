@@ -297,3 +297,30 @@ def test_one_increment_is_enough(device, stretch):
     assert np.linalg.norm(state.points()[-1] - [1.0, 1.0, 0.0]) > 0.5
     (reaction,) = model.reactions(state)
     np.testing.assert_allclose(reaction.force, (-1.0, -3.0, -2.0), atol=1e-6)
+
+
+def test_nodes_that_coincide_are_joined_once():
+    """Crossing rods are joined; nodes of earlier joints stay."""
+    scene = weightless()
+    along = [line((0.0, y, 0.0), (2.0, y, 0.0), 4) for y in (0.0, 1.0)]
+    across = [line((x, 0.0, 0.0), (x, 1.0, 0.0), 2) for x in (0.0, 1.0, 2.0)]
+    scene.add_rods(along + across, section=SECTION)
+    scene.join([(0, 0), (2, 0)], rigid=False)
+    scene.join_coincident()
+    members = {joint.members: joint.rigid for joint in scene.joints}
+    assert members == {
+        ((0, 0), (2, 0)): False,
+        ((0, 2), (3, 0)): True,
+        ((0, 4), (4, 0)): True,
+        ((1, 0), (2, 2)): True,
+        ((1, 2), (3, 2)): True,
+        ((1, 4), (4, 2)): True,
+    }
+
+
+def test_three_ends_make_one_joint():
+    scene = weightless()
+    for direction in (X, Y, Z):
+        scene.add_rod(line(0.0 * X, direction, 3), section=SECTION)
+    scene.join_coincident(rigid=False)
+    assert [joint.members for joint in scene.joints] == [((0, 0), (1, 0), (2, 0))]

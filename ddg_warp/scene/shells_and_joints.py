@@ -1,9 +1,10 @@
 """Shells of a scene with supports and loads, joints of rods, and attachments of rods to shells."""
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from ddg_warp.scene.law import Law, laws_of
 from ddg_warp.scene.magnets import Magnets
 from ddg_warp.scene.material import Material
 from ddg_warp.scene.prescribed_motion import Motion
+from ddg_warp.typing import Amplitude, Axis, Numbers, Selection, Vector
 
 COINCIDE = 1e-6  # largest distance of coincident or coplanar points, over the largest coordinate
 
@@ -40,14 +42,14 @@ class Structures(Meridians, Magnets, Contacts):
 
     def add_shell(
         self,
-        points,
-        triangles,
+        points: Numbers,
+        triangles: Numbers,
         *,
-        thickness,
+        thickness: Numbers,
         material: Material,
-        bending: str = "midedge_dof",
-        membrane: str = "flat",
-        rest="shape",
+        bending: Literal["midedge_dof", "midedge_boundary", "midedge", "hinge", "isometric"] = "midedge_dof",
+        membrane: Literal["flat", "curved"] = "flat",
+        rest: Literal["shape", "flat"] | tuple[Numbers, Numbers] = "shape",
         name: str = "shell",
         laws: Mapping[str, Law] | None = None,
     ) -> Handle:
@@ -95,7 +97,12 @@ class Structures(Meridians, Magnets, Contacts):
         return Handle(len(self.shells) - 1, SHELL, name)
 
     def hold(
-        self, shell: int, vertices, components: str = "xyz", motion: Motion | Grip | None = None, name: str = ""
+        self,
+        shell: int,
+        vertices: Selection,
+        components: str = "xyz",
+        motion: Motion | Grip | None = None,
+        name: str = "",
     ) -> Handle:
         """Fix or prescribe components of vertices of a shell, free to rotate (simply supported).
 
@@ -104,7 +111,12 @@ class Structures(Meridians, Magnets, Contacts):
         return self._hold("hold", shell, vertices, components, motion=motion, name=name)
 
     def clamp_boundary(
-        self, shell: int, vertices, components: str = "xyz", motion: Motion | Grip | None = None, name: str = ""
+        self,
+        shell: int,
+        vertices: Selection,
+        components: str = "xyz",
+        motion: Motion | Grip | None = None,
+        name: str = "",
     ) -> Handle:
         """Clamp a shell: fix components of vertices, and the normal at mesh edges between them, interior edges too.
 
@@ -116,7 +128,9 @@ class Structures(Meridians, Magnets, Contacts):
         self._need_edges("clamp_boundary", shell, vertices, np.arange(len(surface.edges)), "mesh edge", "hold")
         return self._hold("clamp_boundary", shell, vertices, components, edges="clamp", motion=motion, name=name)
 
-    def symmetry(self, shell: int, vertices, axis, motion: Motion | Grip | None = None, name: str = "") -> Handle:
+    def symmetry(
+        self, shell: int, vertices: Selection, axis: Axis | Vector, motion: Motion | Grip | None = None, name: str = ""
+    ) -> Handle:
         """Add a symmetry plane through boundary vertices, orthogonal to the surface.
 
         Args:
@@ -155,7 +169,7 @@ class Structures(Meridians, Magnets, Contacts):
         return self._hold("symmetry", shell, vertices, axis, **options)
 
     def add_vertex_force(
-        self, shell: int, vertices, force, amplitude: Callable[[float], float] | None = None
+        self, shell: int, vertices: Selection, force: Numbers, amplitude: Amplitude | None = None
     ) -> Handle:
         """Add a dead force [N] on each of some vertices, (3,) or (V, 3). In statics it grows with the load parameter."""
         vertices = argument_checks.once("add_vertex_force: vertices", self._vertices(shell, vertices))
@@ -164,7 +178,7 @@ class Structures(Meridians, Magnets, Contacts):
         self.shell_loads.append(ShellLoad(shell, vertices, force, amplitude))
         return Handle(len(self.shell_loads) - 1, "shell load")
 
-    def add_edge_force(self, shell: int, path, force, amplitude: Callable[[float], float] | None = None) -> Handle:
+    def add_edge_force(self, shell: int, path: Selection, force: Vector, amplitude: Amplitude | None = None) -> Handle:
         """Add a dead force per length (3,) [N/m] along mesh edges, half of each edge's force to either end.
 
         Args:
@@ -183,7 +197,9 @@ class Structures(Meridians, Magnets, Contacts):
         self.shell_loads.append(ShellLoad(shell, vertices, length[vertices, None] * force, amplitude))
         return Handle(len(self.shell_loads) - 1, "shell load")
 
-    def add_edge_couple(self, shell: int, path, couple, amplitude: Callable[[float], float] | None = None) -> Handle:
+    def add_edge_couple(
+        self, shell: int, path: Selection, couple: Numbers, amplitude: Amplitude | None = None
+    ) -> Handle:
         """Add a couple per length at rest [N] about boundary edges: a follower edge moment.
 
         Positive by the right hand about the edge with the surface to its left: a positive couple makes the surface convex on the side
@@ -218,7 +234,13 @@ class Structures(Meridians, Magnets, Contacts):
         return Handle(len(self.edge_couples) - 1, "edge couple")
 
     def add_pressure(
-        self, shell: int, pressure, triangles=None, *, dead: bool = False, amplitude: Callable | None = None
+        self,
+        shell: int,
+        pressure: Numbers,
+        triangles: Selection | None = None,
+        *,
+        dead: bool = False,
+        amplitude: Amplitude | None = None,
     ) -> Handle:
         """Add pressure [Pa] along the normals of triangles (all by default).
 
@@ -275,7 +297,44 @@ class Structures(Meridians, Magnets, Contacts):
             )
         self.joints.append(Joint(tuple(pairs), rigid, laws))
 
-    def attach(self, rod: int, nodes, shell: int, vertices, spin: str = "glued") -> None:
+    def join_coincident(
+        self, rods: Selection | None = None, rigid: bool = True, laws: Mapping[str, Law] | None = None
+    ) -> None:
+        """Join rods wherever nodes coincide at rest: gridshells, lattices. Nodes of earlier joints stay as they are.
+
+        Args:
+            rods: rods to join, by default all rods added so far.
+            rigid, laws: of every joint, see `join`.
+
+        Raises:
+            SceneError: no nodes coincide.
+        """
+        from scipy.spatial import cKDTree
+
+        rods = argument_checks.once(
+            "join_coincident: rods", self._rods(range(self.rod_count) if rods is None else rods)
+        )
+        points, members = [], []
+        for batch in self._batches(rods):
+            for rod in rods[(rods >= batch.first) & (rods < batch.first + batch.rods)].tolist():
+                points.append(batch.points[rod - batch.first])
+                members += [(rod, node) for node in range(batch.nodes)]
+        points, earlier = np.concatenate(points), {member for joint in self.joints for member in joint.members}
+        groups: dict[int, list[int]] = {}
+        for first, second in sorted(cKDTree(points).query_pairs(COINCIDE * np.abs(points).max())):
+            if earlier.isdisjoint((members[first], members[second])):
+                groups.setdefault(first, [first]).append(second)
+        joined: set[int] = set()
+        for first, group in groups.items():
+            if first not in joined:  # later nodes of a group list the rest of it again
+                joined.update(group)
+                self.join([members[index] for index in group], rigid, laws)
+        if not joined:
+            raise SceneError("join_coincident: no nodes coincide at rest; give rods that cross or meet at nodes")
+
+    def attach(
+        self, rod: int, nodes: Selection, shell: int, vertices: Selection, spin: Literal["glued", "free"] = "glued"
+    ) -> None:
         """Merge nodes of a rod with vertices of a shell, coincident at rest: a stiffener, a rim, a post.
 
         Args:

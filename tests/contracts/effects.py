@@ -237,6 +237,12 @@ scene_call("join", {"members": [(0, -1), (1, 0)]}, {
                       s.add_rod(ARC * [1, -1, 1], section=ddg.Circle(0.02), material=RUBBER)), lambda s: s.clamp(0))  # fmt: skip
 CALLS["join"].rows["members"] = [(0, 0), (2, 0)]
 
+scene_call("join_coincident", {}, {
+    "rods": [0, 2], "rigid": False, "laws": {"rigid_joint": ddg.Law(quadratic, stiffness=0.1)}},
+           lambda s: (s.add_rods([ARC, ARC[[-1]] + ARC], section=ddg.Circle(0.02), material=RUBBER),
+                      s.add_rod(ARC[[-1]] + ARC * [1, -1, 1], section=ddg.Circle(0.02), material=RUBBER)),
+           lambda s: s.clamp(0))  # fmt: skip
+
 
 # --- sections, materials, laws, drag ---
 def observe_section(section, material=RUBBER, **scene) -> list:
