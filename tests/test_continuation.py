@@ -89,6 +89,22 @@ def test_steep_truss_bifurcates_before_it_snaps(device):
     assert [count for count, _ in groupby(counts)] == [0, 1, 2, 1]
 
 
+def test_plot_tells_stable_from_unstable(device):
+    """Lines have all points, full ones the stable points; special points are marked, and branches use the same axes."""
+    pytest.importorskip("matplotlib")
+    continuation, height = truss(device, 3.0)
+    path = continuation.trace(stop=StopCriterion(displacement=("drop", -1.0, height)))
+    axes = path.plot("drop")
+    line, stable, limits, bifurcations = axes.lines
+    np.testing.assert_array_equal(line.get_xydata(), np.stack([path.values("drop"), path.load], axis=1))
+    np.testing.assert_array_equal(np.isfinite(stable.get_xdata()), path.stable)
+    assert len(limits.get_xdata()) == len(path.limit_points) == 1
+    assert len(bifurcations.get_xdata()) == len(path.bifurcations) == 2
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("drop [m]", "load parameter")
+    assert path.plot("drop", axes) is axes
+    assert len(axes.lines) == 8
+
+
 def test_branch_of_the_truss(device):
     """Bars of different lengths are in equilibrium; the other side is the mirror image.
 

@@ -2,14 +2,22 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
+from ddg_warp.typing import Axis, Bools, Floats, Integers
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from ddg_warp.model.state import State
+    from ddg_warp.solve.equilibrium.tangent import Tangent
 
 REGULAR, LIMIT_POINT, BIFURCATION = "regular", "limit point", "bifurcation"
+MARKERS = {LIMIT_POINT: "o", BIFURCATION: "s"}  # of `Path.plot`
 
 
 @argument_checks.called
@@ -22,7 +30,7 @@ class Displacement:
             `State.points`; rods by index, handle or name, shells by handle or name.
     """
 
-    terms: tuple[tuple[int | tuple[int | str, int], str, float], ...]
+    terms: tuple[tuple[int | tuple[int | str, int], Axis, float], ...]
 
     def __post_init__(self):
         terms = self.terms if isinstance(self.terms, tuple | list) else [self.terms]
@@ -41,11 +49,11 @@ class Displacement:
             argument_checks.number("Displacement: weight", term[2])
 
     @classmethod
-    def of(cls, point: int | tuple[int | str, int], axis: str, weight: float = 1.0) -> "Displacement":
+    def of(cls, point: int | tuple[int | str, int], axis: Axis, weight: float = 1.0) -> "Displacement":
         """Return the displacement of one point, (rod, node) or a row of `State.points`; weight -1 reverses the axis."""
         return cls(((point, axis, weight),))
 
-    def vector(self, tangent) -> np.ndarray:
+    def vector(self, tangent: "Tangent") -> Floats:
         """Return the derivative with respect to all dofs (size,).
 
         Raises:
@@ -111,16 +119,16 @@ class Point:
         mode_displacements: the mode by node (P, 3), in the order of `State.points`; None without a mode.
     """
 
-    state: Any
+    state: "State"
     load: float
     arclength: float
     values: dict[str, float]
     negative: int
     kind: str
-    direction: np.ndarray
-    mode: np.ndarray | None = None
+    direction: Floats
+    mode: Floats | None = None
     iterations: int = 0
-    mode_displacements: np.ndarray | None = None
+    mode_displacements: Floats | None = None
 
     def __repr__(self) -> str:
         watched = "".join(f", {name} {value:.6g} m" for name, value in self.values.items())
@@ -153,17 +161,17 @@ class Path:
         return f"<Path of {len(self)} equilibria{between}; ended by {self.outcome or 'nothing yet'}>"
 
     @property
-    def load(self) -> np.ndarray:
+    def load(self) -> Floats:
         """Load parameters (points,)."""
         return np.array([point.load for point in self.points])
 
     @property
-    def negative(self) -> np.ndarray:
+    def negative(self) -> Integers:
         """Numbers of negative eigenvalues (points,)."""
         return np.array([point.negative for point in self.points])
 
     @property
-    def stable(self) -> np.ndarray:
+    def stable(self) -> Bools:
         """Stability of each point (points,) bool."""
         return self.negative == 0
 
@@ -173,13 +181,33 @@ class Path:
         return [point.kind for point in self.points]
 
     @property
-    def arclength(self) -> np.ndarray:
+    def arclength(self) -> Floats:
         """Arc lengths (points,)."""
         return np.array([point.arclength for point in self.points])
 
-    def values(self, name: str) -> np.ndarray:
+    def values(self, name: str) -> Floats:
         """Return a watched displacement (points,) [m]; names are the keys of `points[0].values`."""
         return np.array([point.values[name] for point in self.points])
+
+    def plot(self, name: str, axes: "Axes | None" = None) -> "Axes":
+        """Draw the load parameter over a watched displacement; return the axes of matplotlib.
+
+        Lines are full where equilibria are stable, else broken. Limit points and bifurcations are marked.
+
+        Args:
+            name: watched displacement.
+            axes: axes to draw into, for paths of several branches; by default a new figure.
+        """
+        import matplotlib.pyplot as plt
+
+        axes = plt.figure().add_subplot(xlabel=f"{name} [m]", ylabel="load parameter") if axes is None else axes
+        values, load = self.values(name), self.load
+        (line,) = axes.plot(values, load, "--", linewidth=1.0)
+        axes.plot(np.where(self.stable, values, np.nan), load, color=line.get_color(), linewidth=2.0)
+        for kind, marker in MARKERS.items():
+            marked = self.of_kind(kind)
+            axes.plot([point.values[name] for point in marked], [point.load for point in marked], marker, color="k")
+        return axes
 
     def of_kind(self, kind: str) -> list[Point]:
         """Return the points of a kind: "regular", "limit point" or "bifurcation"."""
