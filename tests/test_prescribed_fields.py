@@ -317,8 +317,14 @@ def test_refusals(device):
     refused(lambda: statics.solve(model, rest={0: {"curvature": 1.0}}), "rest[0]", "field 'muscle'")
     refused(lambda: ddg.Samples([1.0, 2.0], times=[1.0, 0.0]), "times")
     refused(lambda: ddg.Samples([1.0, 2.0, 3.0], times=[0.0, 1.0]), "values have shape (3,)")
+    refused(lambda: ddg.Samples(np.zeros((2, 3, 4)), [0.0, 1.0], [0.0, 1.0, 2.0]), "values have shape (2, 3, 4)")
     moving = scene_of(values=lambda t: t).build(device)
     refused(lambda: ddg.continuation.Continuation(moving), "continuation", "load_steps")
+
+
+def test_samples_in_time_have_any_shape():
+    poses = ddg.Samples(np.arange(24.0).reshape(2, 2, 6), times=[0.0, 1.0])
+    np.testing.assert_array_equal(poses(0.5), np.arange(12.0).reshape(2, 6) + 6.0)
 
 
 @pytest.mark.parametrize(

@@ -122,3 +122,50 @@ def test_short_names_of_readers_and_the_simulator():
     code = "import ddg_warp as ddg; from ddg_warp.io.mesh_read import read_mesh; assert ddg.read_mesh is read_mesh; "
     code += "assert ddg.read_curves is ddg.io.read"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def gripped() -> ddg.Scene:
+    scene = cable()
+    scene.clamp(0, motion=ddg.Grip(), name="grip")
+    return scene
+
+
+def rising(t: float) -> ddg.Controls:
+    return ddg.Controls(poses=[[0.0, 0.0, t * t, 0.0, 0.0, 0.0]])
+
+
+def test_simulate_and_run_follow_controls_of_time(device):
+    """Runs with controls as a function of time equal a loop, bit for bit, with its wrenches."""
+    result = ddg.simulate(gripped(), device=device, controls=rising, wrenches=True, progress=False)
+    model = gripped().build(device)
+    integrator, state, forces = ddg.Integrator(model), model.state(), []
+    integrator.watch_wrenches()
+    for _ in range(5):
+        state = integrator.step(state, 0.01, rising(state.time + 0.01))
+        forces.append(integrator.wrenches()["grip"].force)
+    np.testing.assert_array_equal(result.state.points(), state.points())
+    np.testing.assert_array_equal(result.wrenches["grip"].force[1:], forces)
+    (*_, state) = ddg.Integrator(model).run(0.05, dt=0.01, controls=rising)
+    np.testing.assert_array_equal(result.state.points(), state.points())
+
+
+def test_static_wrenches_carry_the_weight_at_every_load_step(device):
+    """The clamp carries the load parameter times the weight; a path has no wrenches."""
+    result = ddg.simulate(cable(ddg.Statics(load_steps=4), clamped=True), device=device, wrenches=True, progress=False)
+    weight = 1000.0 * np.pi * 0.02**2 * 9.81
+    np.testing.assert_allclose(result.times, [0.0, 0.25, 0.5, 0.75, 1.0])
+    np.testing.assert_allclose(result.wrenches[0].force[:, 2], weight * result.times, rtol=1e-6, atol=1e-9)
+    with pytest.raises(ValueError, match="a path takes no controls and no wrenches"):
+        ddg.simulate(cable(ddg.PathAnalysis(), clamped=True), device=device, wrenches=True)
+    with pytest.raises(ValueError, match="the run kept none"):
+        _ = ddg.simulate(cable(), device=device, progress=False).wrenches
+
+
+def test_controls_scale_with_the_load_parameter(device):
+    """Poses as a function of the load parameter hold at every load step."""
+    scene = cable(ddg.Statics(load_steps=3))
+    scene.clamp(0, motion=ddg.Grip())
+    result = ddg.simulate(
+        scene, device=device, controls=rising, observe=lambda model, state: {"z": state.poses()[0, 2]}, progress=False
+    )
+    np.testing.assert_allclose(result.series["z"], result.times**2, atol=1e-12)

@@ -1,13 +1,17 @@
 """Controls: loads, poses of grips, gravity and field of one time step or static solve, per world."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from ddg_warp import argument_checks, host_arrays
 from ddg_warp.errors import SceneError
+from ddg_warp.typing import Floats, Numbers
+
+if TYPE_CHECKING:
+    from ddg_warp.model.model import Model
 
 
 @argument_checks.called
@@ -34,14 +38,14 @@ class Controls:
             with an axis of worlds in front; (worlds,) is one number a world.
     """
 
-    poses: Any = None
-    forces: Any = None
-    moments: Any = None
-    gravity: Any = None
-    field: Any = None
-    fields: Any = None
+    poses: Numbers | None = None
+    forces: Numbers | None = None
+    moments: Numbers | None = None
+    gravity: Numbers | None = None
+    field: Numbers | None = None
+    fields: Mapping[str, Numbers] | None = None
 
-    def checked(self, model) -> dict[str, np.ndarray]:
+    def checked(self, model: "Model") -> dict[str, Floats]:
         """Return the given inputs by name, each with an axis of worlds (1 or worlds, ...); "fields" is a dict.
 
         Raises:
@@ -57,6 +61,9 @@ class Controls:
         if prescribed is not None:
             result["fields"] = _checked_fields(model, prescribed)
         return result
+
+
+TimedControls: TypeAlias = Controls | Callable[[float], Controls] | None
 
 
 def _checked_fields(model, values) -> dict[str, np.ndarray]:
@@ -78,6 +85,11 @@ def named_field(model, name: str):
         listed = ", ".join(map(repr, model.fields.items)) or "none; add one by scene.prescribe(name, parameter)"
         raise SceneError(f"Controls: fields: there is no field {name!r}; the model has {listed}")
     return model.fields.items[name]
+
+
+def controls_at(controls: "TimedControls", t: float) -> Controls | None:
+    """Return the controls of a step that ends at t [s], from controls or a function of time."""
+    return controls(t) if callable(controls) else controls
 
 
 def checked(controls: Controls | None, model, call: str = "step") -> dict[str, np.ndarray]:

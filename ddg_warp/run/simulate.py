@@ -1,5 +1,7 @@
 """Run and record the analysis of a scene. The loop is short on purpose: copy it for variants."""
 
+from __future__ import annotations
+
 import os
 import time
 from collections import Counter
@@ -9,19 +11,28 @@ from dataclasses import dataclass, field
 from functools import partial
 from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ddg_warp import argument_checks
 from ddg_warp.errors import SolverError
 from ddg_warp.io.observed import checked_observed
+from ddg_warp.model.controls import Controls, TimedControls, controls_at
 from ddg_warp.progress import Heartbeat, progress_bar
 from ddg_warp.run.check import Check
-from ddg_warp.run.run_directory import SUMMARY
+from ddg_warp.run.run_directory import SUMMARY, RunDirectory
 from ddg_warp.run.scene_registry import RUN_SETTINGS, InputError
-from ddg_warp.scene.descriptions import Dynamics, Statics
+from ddg_warp.scene.descriptions import Dynamics, PathAnalysis, Statics
+from ddg_warp.scene.equilibrium_path import Path as EquilibriumPath
 from ddg_warp.scene.scene import Scene
+from ddg_warp.typing import Device, FilePath, Floats, Numbers, Option, Precision
+
+if TYPE_CHECKING:
+    from ddg_warp.model.model import Model
+    from ddg_warp.model.state import State
+    from ddg_warp.run.step_choice import StepChoice
+    from ddg_warp.solve.stepping.wrenches import Reactions
 
 MOST_STEPS = 2**53  # consecutive integers that floats distinguish
 
@@ -55,15 +66,16 @@ class Result:
         checks: Checks of the run (`Check`), if a check was given.
         name, parameters: Name of the scene and parameters of its `build`, from the provenance.
         directory: Directory of the recorded run; None if it was not recorded.
+        kept_wrenches: See `wrenches`; None unless requested.
     """
 
     scene: Scene
-    model: Any
-    state: Any
-    times: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    series: dict[str, np.ndarray] = field(default_factory=dict)
-    statistics: dict = field(default_factory=dict)
-    energies: dict[str, dict[str, float]] = field(default_factory=dict)
+    model: Model
+    state: State
+    times: Floats = field(default_factory=lambda: np.zeros(0))
+    series: dict[str, Floats] = field(default_factory=dict)
+    statistics: dict[str, object] = field(default_factory=dict)
+    energies: dict[str, dict[str, float | Floats]] = field(default_factory=dict)
     dt: float | None = None
     step_times: list[float] = field(default_factory=list)
     wall_time: float = 0.0
@@ -71,13 +83,14 @@ class Result:
     counted_from: float | None = None
     failure: str = ""
     outcome: str = "converged"
-    path: Any = None
-    choice: Any = None
-    learned: Any = None
+    path: EquilibriumPath | None = None
+    choice: StepChoice | None = None
+    learned: object = None
     checks: list[Check] = field(default_factory=list)
     name: str = "scene"
-    parameters: dict = field(default_factory=dict)
+    parameters: dict[str, object] = field(default_factory=dict)
     directory: Path | None = None
+    kept_wrenches: Reactions | None = None
 
     def __repr__(self) -> str:
         reached = f"{self.times[0]:g} to {self.times[-1]:g}" if len(self.times) else "none"
@@ -97,12 +110,26 @@ class Result:
         self.failure, self.outcome = f"{said}{error}", error.outcome or "failed"
 
     @property
+    def wrenches(self) -> Reactions:
+        """Forces and moments of supports and obstacles by index, name or handle, with an axis of states in front.
+
+        A state after a step has the wrenches of `Integrator.wrenches`, the first state and load steps have `Model.reactions`. A resumed
+        run has no states from before.
+
+        Raises:
+            InputError: The run kept none.
+        """
+        if self.kept_wrenches is None:
+            raise InputError("wrenches: the run kept none; call simulate(..., wrenches=True)")
+        return self.kept_wrenches
+
+    @property
     def seconds_per_step(self) -> float:
         """Mean time of a step [s], if possible without the first two, which compile and capture."""
         steady = self.step_times[2:] or self.step_times
         return sum(steady) / len(steady) if steady else 0.0
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """Return the content of summary.json; see `ddg_warp.run.summary`."""
         from ddg_warp.run.summary import summary
 
@@ -150,22 +177,24 @@ class Result:
 def simulate(
     scene: Scene,
     *,
-    device: str | None = None,
-    precision: str | None = None,
+    device: Device = None,
+    precision: Precision | None = None,
     worlds: int = 1,
-    out: str | Path | None = None,
+    out: FilePath | RunDirectory | None = None,
     dt: float | None = None,
     duration: float | None = None,
-    resume: str | Path | None = None,
+    resume: FilePath | None = None,
     force: bool = False,
     fields: Sequence[str] = (),
     usd: bool = True,
-    observe: Callable[[Any, Any], Mapping[str, float]] | None = None,
+    observe: Callable[[Model, State], Mapping[str, Numbers]] | None = None,
     check: Callable[[Result], Sequence[Check]] | None = None,
-    module: Any = None,
+    module: object = None,
     picture: bool = True,
-    provenance: Mapping | None = None,
-    options: Mapping | None = None,
+    provenance: Mapping[str, object] | None = None,
+    options: Mapping[str, Option] | None = None,
+    controls: TimedControls = None,
+    wrenches: bool = False,
     clock: Callable[[], float] | None = None,
     progress: bool = True,
 ) -> Result:
@@ -191,6 +220,8 @@ def simulate(
         picture: Whether to draw picture.png into `out`, if matplotlib is installed.
         provenance: Attributes of the trajectory: scene, parameters, command.
         options: Keyword arguments of the `Integrator` or of `StaticsOptions`: rtol, instead of the scene's, and others.
+        controls: `Controls` of every step or load step, or a function of the time (load parameter) at its end that returns them.
+        wrenches: Whether to keep forces and moments of supports, see `Result.wrenches`.
         clock: Clock of `step_times` [s]; by default wall time, synchronised on CUDA.
         progress: Whether to show progress: a bar on a terminal, a line every ten seconds elsewhere.
 
@@ -209,7 +240,7 @@ def simulate(
     _check(
         worlds,
         fields,
-        flags={"force": force, "usd": usd, "progress": progress, "picture": picture},
+        flags={"force": force, "usd": usd, "progress": progress, "picture": picture, "wrenches": wrenches},
         functions={"observe": observe, "check": check, "clock": clock},
         mappings={"provenance": provenance, "options": options},
         paths={"out": out, "resume": resume},
@@ -218,9 +249,16 @@ def simulate(
     dynamic = isinstance(analysis, Dynamics)
     if not dynamic and (dt, duration, resume) != (None, None, None):
         raise InputError("this scene is static: it takes no dt, no duration and nothing to resume")
+    if isinstance(analysis, PathAnalysis) and (controls is not None or wrenches):
+        raise InputError(
+            "a path takes no controls and no wrenches; leave them out, and call model.reactions(point.state, factor=point.load) for "
+            "each point of result.path"
+        )
+    if controls is not None and not (isinstance(controls, Controls) or callable(controls)):
+        raise InputError(f"controls are {controls!r}; give Controls(...), or a function of the time that returns it")
     if dynamic:
         if analysis.error is not None:
-            _check_error(scene, resume, options or {})
+            _check_error(scene, resume, options or {}, controls)
         stored = {"dt": analysis.dt, "duration": analysis.duration}
         if resume is not None:
             if force or (out is not None and Path(out) != Path(resume)):
@@ -267,7 +305,7 @@ def simulate(
         start = {f"energy/{name}": np.array(value) for name, value in result.energies["start"].items()}
         return counted() | start | {f"clock/{name}": np.array(value) for name, value in clocks().items()}
 
-    options = dict(options or {})
+    options, reactions = dict(options or {}), []
     with ExitStack() as stack:
         recorder = None
         if resume is not None and done >= steps:
@@ -286,8 +324,8 @@ def simulate(
             options.setdefault("check_every", 1)  # recording synchronises every step anyway
         bar = stack.enter_context(progress_bar(steps, done, progress))
 
-        def keep(state, observed: Mapping | None = None, counts: Callable | None = None) -> None:
-            """Record a state, with observed values and the counters of `counts()`."""
+        def keep(state, observed: Mapping | None = None, counts: Callable | None = None, integrator=None) -> None:
+            """Record a state, with observed values and the counters of `counts()`; `integrator` has wrenches of its step."""
             nonlocal counted
             counted = counts
             if len(result.step_times) == 1:
@@ -297,6 +335,9 @@ def simulate(
             values = checked_observed(values, result.series.keys() if len(result.times) else None)
             result.state = state
             result.times.append(float(state.time))
+            if wrenches:
+                factor = 1.0 if dynamic else state.time
+                reactions.append(integrator.wrenches() if integrator else model.reactions(state, factor=factor))
             for name, value in values.items():
                 result.series.setdefault(name, []).append(value)
             if recorder is not None:
@@ -304,12 +345,16 @@ def simulate(
 
         try:
             keywords = {"options": options, "clock": clock or wall_clock(model.device), "bar": bar}
-            run(result, steps, keep, **keywords, **({"counts": counts} if dynamic else {}))
+            if not isinstance(analysis, PathAnalysis):
+                keywords["controls"] = controls
+            run(result, steps, keep, **keywords, **({"counts": counts, "wrenches": wrenches} if dynamic else {}))
         except SolverError as error:
             result.fail(error)
             result.state = error.state if error.state is not None else result.state
     result.wall_time, result.compile_time = clocks().values()
     result.energies["end"] = energies(model, result.state)
+    if reactions:
+        result.kept_wrenches = type(reactions[0]).series(reactions, model.scene)
     directory = out if out is not None else resume
     if resume is not None and done >= steps and (Path(resume) / SUMMARY).exists():
         directory = None  # a finished run stays as it is
@@ -349,10 +394,12 @@ def _check(worlds, fields, *, flags: Mapping, functions: Mapping, mappings: Mapp
             raise InputError(f"{name} is {value!r}; give the path of a directory")
 
 
-def _check_error(scene: Scene, resume, options: Mapping) -> None:
+def _check_error(scene: Scene, resume, options: Mapping, controls: TimedControls) -> None:
     """Refuse settings that do not go with `Dynamics(error=...)`."""
     if resume is not None:
         raise InputError("a run with Dynamics(error=...) is not resumed; record it again, or give dt and rtol instead")
+    if controls is not None:
+        raise InputError("Dynamics: error takes pilot runs, which have no controls; leave out controls or error")
     if scene.callbacks:
         raise InputError(
             "Dynamics: error takes pilot runs, and callbacks of the scene would be called in each; leave out callbacks or error"
@@ -364,13 +411,24 @@ def _check_error(scene: Scene, resume, options: Mapping) -> None:
         raise InputError("options: failures='flag' does not go with Dynamics(error=...); leave out one of them")
 
 
-def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar, counts: Mapping) -> None:
+def advance(
+    result: Result,
+    steps: int,
+    keep: Callable,
+    *,
+    options: Mapping,
+    clock,
+    bar,
+    counts: Mapping,
+    controls: TimedControls,
+    wrenches: bool,
+) -> None:
     """Step to the end and `keep` each state. The scene's callbacks run inside of `integrator.step`.
 
     Args:
         result: Result so far.
         steps: Number of steps of the whole run.
-        keep, options, clock, bar: See `simulate`.
+        keep, options, clock, bar, controls, wrenches: See `simulate`.
         counts: Counters of a resumed run, see `counts_of`.
     """
     from ddg_warp.run.counts import counts_of, repeat, statistics
@@ -386,6 +444,8 @@ def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clo
         settings["rtol"] = result.choice.rtol
     substeps = 2**result.choice.halvings if result.choice else 1
     integrator = Integrator(result.model, **settings | options)
+    if wrenches:
+        integrator.watch_wrenches()
     counted = partial(counts_of, integrator)
     if not len(result.times):
         keep(result.state, counts=counted)
@@ -394,16 +454,19 @@ def advance(result: Result, steps: int, keep: Callable, *, options: Mapping, clo
         for _ in range(round(float(state.time) / result.dt), steps):
             started = clock()
             for _ in range(substeps):
-                state = integrator.step(state, result.dt / substeps)
+                length = result.dt / substeps
+                state = integrator.step(state, length, controls_at(controls, state.time + length))
             result.step_times.append(clock() - started)
-            keep(state, counts=counted)
+            keep(state, counts=counted, integrator=integrator)
             bar.update()
         integrator.check(state)
     finally:
         result.statistics = statistics(integrator, counts)
 
 
-def equilibrate(result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar) -> None:
+def equilibrate(
+    result: Result, steps: int, keep: Callable, *, options: Mapping, clock, bar, controls: TimedControls
+) -> None:
     """Solve all load steps and `keep` each equilibrium."""
     from ddg_warp.solve.equilibrium.statics import Equilibrium, StaticsOptions, progress_of
 
@@ -414,7 +477,8 @@ def equilibrate(result: Result, steps: int, keep: Callable, *, options: Mapping,
         for step in range(steps):
             started, before = clock(), equilibrium.iterations
             with Heartbeat("statics", partial(progress_of, equilibrium), not bar.disable):
-                state = equilibrium.load(state, 1, step / steps, (step + 1) / steps)
+                end = (step + 1) / steps
+                state = equilibrium.load(state, 1, step / steps, end, controls_at(controls, end))
             result.step_times.append(clock() - started)
             iterations.append(equilibrium.iterations - before)
             outcomes[equilibrium.outcome] += 1
@@ -476,7 +540,7 @@ def step_count(dt: float, duration: float) -> int:
     return steps
 
 
-def settings_to_resume(directory: Path, asked: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def settings_to_resume(directory: Path, asked: Mapping[str, object] | None = None) -> dict[str, object]:
     """Return time step [s], precision, worlds and end [s] of the run in a directory.
 
     Args:

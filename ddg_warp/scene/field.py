@@ -2,11 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError, SolverError
+from ddg_warp.typing import Floats, Numbers, Selection
 
 OVER = ("time", "arc_length", "position")
 FORMS = ("metric", "curvature", "angle")  # of shells
@@ -29,9 +31,9 @@ class Samples:
         SceneError: values do not fit times and arc lengths or are not finite, or times or arc lengths do not ascend.
     """
 
-    values: np.ndarray
-    times: np.ndarray | None = None
-    arc_lengths: np.ndarray | None = None
+    values: Numbers
+    times: Numbers | None = None
+    arc_lengths: Numbers | None = None
 
     def __post_init__(self):
         expected = ()
@@ -45,14 +47,14 @@ class Samples:
         if not expected:
             raise SceneError("Samples: there are no times and no arc_lengths; give one of them")
         values = argument_checks.array("Samples: values", self.values, f"give numbers of shape {expected}").copy()
-        vectors = self.arc_lengths is None and values.ndim > 1
-        if values.shape[: len(expected)] != expected or values.ndim > len(expected) + vectors:
+        surplus = self.arc_lengths is not None and values.ndim > len(expected)
+        if values.shape[: len(expected)] != expected or surplus:
             raise SceneError(f"Samples: values have shape {values.shape}; give {expected}")
         if not np.isfinite(values).all():
             raise SceneError("Samples: values are not all finite; give finite numbers")
         object.__setattr__(self, "values", values)
 
-    def __call__(self, *where) -> np.ndarray:
+    def __call__(self, *where: float | Floats) -> Floats:
         """Return the value at t, or at (s, t) with arc lengths."""
         values, t = self.values, where[-1]
         if self.times is not None:
@@ -126,10 +128,10 @@ class Fields:
         self,
         name: str,
         parameter: str,
-        values: float | np.ndarray | Callable = 0.0,
+        values: Numbers | Callable[[float], Numbers] | Callable[[Floats, float], Numbers] = 0.0,
         *,
-        rods=None,
-        over: str = "time",
+        rods: Selection | None = None,
+        over: Literal["time", "arc_length", "position"] = "time",
         shell: int | None = None,
     ) -> None:
         """Prescribe a rest strain of rods, or the rest form of a shell, as a field: muscles, growth, swelling.

@@ -603,10 +603,11 @@ each("recorder", "counts", [3, {}, "all"], lambda v: recorder(counts=v), "counts
 
 
 # --- simulate ---
-for name in ("force", "usd", "progress"):
+for name in ("force", "usd", "progress", "wrenches"):
     each("simulate", name, ["yes", 1, None], lambda v, n=name: run(**{n: v}), name, "True or False")
 for name in ("observe", "clock"):
     each("simulate", name, [5, "now", [1]], lambda v, n=name: run(**{n: v}), name, "give a function")
+each("simulate", "controls", [5, "poses", [1.0]], lambda v: run(controls=v), "controls", "function of the time")
 for name in ("provenance", "options"):
     each("simulate", name, [5, "text", ["rtol"], {3: 1}], lambda v, n=name: run(**{n: v}), name, "by name")
 each(

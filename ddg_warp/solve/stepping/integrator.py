@@ -1,6 +1,7 @@
 """Time integration on the device: implicit Euler and implicit midpoint rule, with retries."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Literal
 
 import numpy as np
 import warp as wp
@@ -12,8 +13,8 @@ from ddg_warp.compile.precision import lost_in_rounding
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core import outcome
 from ddg_warp.model import validate
-from ddg_warp.model.controls import Controls, checked
-from ddg_warp.model.model import check_model
+from ddg_warp.model.controls import Controls, TimedControls, checked, controls_at
+from ddg_warp.model.model import Model, check_model
 from ddg_warp.model.state import State, check_state
 from ddg_warp.solve.forces.control_loads import LOADS, Given
 from ddg_warp.solve.forces.gyroscopic import Gyroscope
@@ -29,6 +30,7 @@ from ddg_warp.solve.stepping.state_buffers import StateBuffer
 from ddg_warp.solve.stepping.world_reset import WorldReset, outcomes
 from ddg_warp.solve.stepping.wrenches import Reactions, Wrenches
 from ddg_warp.timers import timer
+from ddg_warp.typing import Bools, Names, Option, Scheme
 
 FAILURES = ("raise", "flag")
 SOLVERS = ("newton", "projective")
@@ -93,17 +95,17 @@ class Integrator:
 
     def __init__(
         self,
-        model,
-        scheme: str = "implicit_euler",
+        model: Model,
+        scheme: Scheme = "implicit_euler",
         *,
-        solver: str = "newton",
+        solver: Literal["newton", "projective"] = "newton",
         linear: str = "auto",
         retry_limit: int = 20,
         energy_bound: float | None = energy_drift.BOUND,
         check_every: int | None = None,
-        failures: str = "raise",
+        failures: Literal["raise", "flag"] = "raise",
         gyroscopic: bool | None = None,
-        **options,
+        **options: Option,
     ):
         check_model("Integrator", model)
         argument_checks.choice("scheme", scheme, SCHEMES)
@@ -187,14 +189,14 @@ class Integrator:
         return target
 
     def run(
-        self, duration: float, dt: float, state: State | None = None, controls: Controls | None = None
+        self, duration: float, dt: float, state: State | None = None, controls: TimedControls = None
     ) -> Iterator[State]:
         """Yield the state after every step of dt [s] for `duration` [s].
 
         Args:
             duration: whole number of steps [s]; dt: step length [s].
             state: start of the first step; the rest state by default.
-            controls: see `step`; the same in every step.
+            controls: see `step`: the same in every step, or a function of the time at the end of a step that returns them.
 
         Raises:
             SceneError: the duration is no whole number of steps.
@@ -209,9 +211,9 @@ class Integrator:
         check_state("run", self.model, state)
         return self._run(state, steps, dt, controls)
 
-    def _run(self, state: State, steps: int, dt: float, controls: Controls | None) -> Iterator[State]:
+    def _run(self, state: State, steps: int, dt: float, controls: TimedControls) -> Iterator[State]:
         for _ in range(steps):
-            state = self.step(state, dt, controls)
+            state = self.step(state, dt, controls_at(controls, state.time + dt))
             yield state
         self.check(state)
 
@@ -298,7 +300,7 @@ class Integrator:
             if self.model.precision == "float32" and not self._doubted:
                 self._doubted = part.warn_of_doubt()
 
-    def outcomes(self) -> np.ndarray:
+    def outcomes(self) -> Names:
         """Return the outcome of every world (worlds,): "converged", or the name of the outcome of its failure."""
         return outcomes(self.model, self._parts, self._worlds.outcome_codes)
 
@@ -314,7 +316,7 @@ class Integrator:
             raise SceneError(f"world {world} does not exist; the model has {self.model.worlds}")
         return next(filter(None, (part.failure_in(state, world) for part in self._parts)), "")
 
-    def reset(self, state: State, mask, to: State | None = None) -> State:
+    def reset(self, state: State, mask: Sequence[bool] | Bools, to: State | None = None) -> State:
         """Return a state with the masked worlds replaced by another state; other worlds stay bitwise equal.
 
         Outcomes, retries and energy accounts of the replaced worlds are cleared, so they step as in a new integrator. Time is common to
@@ -355,7 +357,7 @@ class Integrator:
             self._coupled.arrive()
         return following.state
 
-    def statistics(self) -> dict:
+    def statistics(self) -> dict[str, object]:
         """Return counts since the integrator was made: Newton iterations of a solve, retries, lost pivots, outcomes.
 
         "energy", if watched, has the energy drift, the work of damping [J] and the largest relative drift since the last state from

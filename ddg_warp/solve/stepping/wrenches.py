@@ -1,8 +1,9 @@
 """Wrenches of steps: force and moment at every support, grip and obstacle; see `kernels.residual.support_forces`."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import overload
 
 import numpy as np
 import warp as wp
@@ -19,7 +20,9 @@ from ddg_warp.kernels.residual.coupled_residual import inputs_type
 from ddg_warp.kernels.residual.support_forces import ROWS
 from ddg_warp.kernels.stepping import wrench_sums
 from ddg_warp.scene.handle import OBSTACLE, RING_SUPPORT, SHELL_SUPPORT, SUPPORT, Handle, named
+from ddg_warp.scene.scene import Scene
 from ddg_warp.solve.linear.sparse_system import lists
+from ddg_warp.typing import Floats
 
 RUNS = 128  # sums of contact forces of each obstacle on a GPU
 
@@ -34,18 +37,18 @@ class Reaction:
         point: (3,) or (worlds, 3) [m].
     """
 
-    force: np.ndarray
-    moment: np.ndarray
-    point: np.ndarray
+    force: Floats
+    moment: Floats
+    point: Floats
 
 
-class Reactions(list):
+class Reactions(list[Reaction]):
     """Reactions of all supports, by position, by handle or by name.
 
     Supports are ordered as added: of rods, then of shells, rings and obstacles.
     """
 
-    def __init__(self, reactions: Iterable[Reaction], scene):
+    def __init__(self, reactions: Iterable[Reaction], scene: Scene):
         super().__init__(reactions)
         of_kinds = (scene.supports, scene.shell_supports, scene.ring_supports, scene.obstacles)
         self._first, self._names = {}, []
@@ -53,7 +56,13 @@ class Reactions(list):
             self._first[kind] = len(self._names)
             self._names += [support.name for support in supports]
 
-    def __getitem__(self, item):
+    @overload
+    def __getitem__(self, item: int | str) -> Reaction: ...
+
+    @overload
+    def __getitem__(self, item: slice) -> list[Reaction]: ...
+
+    def __getitem__(self, item: int | str | slice) -> Reaction | list[Reaction]:
         """Return the reaction of a position, handle or name; of a slice a list.
 
         Raises:
@@ -69,6 +78,14 @@ class Reactions(list):
 
     def __reduce__(self):
         return list, (list(self),)
+
+    @classmethod
+    def series(cls, reactions: Sequence["Reactions"], scene: Scene) -> "Reactions":
+        """Return the reactions of several states in one, with an axis of states in front of all arrays."""
+        names = ("force", "moment", "point")
+        of_supports = zip(*reactions, strict=True)
+        stacked = (Reaction(*(np.stack([getattr(each, n) for each in s]) for n in names)) for s in of_supports)
+        return cls(stacked, scene)
 
 
 def support_count(scene) -> int:
