@@ -20,6 +20,7 @@ PAGES = [ROOT / "README.md", *(path for path in sorted(DOCS.rglob("*.md")) if pa
 BLOCK = re.compile(r"^```python(?: file=(\S+))?\n(.*?)^```", re.M | re.S)
 COMMAND = re.compile(r"^    (ddg-warp (?:run|sweep|bench|check|gradients|export|info|list).*?)(?: *#.*)?$", re.M)
 FILES = {file: text for page in [*PAGES, *TUTORIALS] for file, text in BLOCK.findall(page.read_text()) if file}
+GOALS = {"arch": 15, "cable": 25, "gridshell": 18, "ring": 20}  # lines of code of tutorials
 LONG = ("strands", "bench")
 OPTIONAL = {
     "torch": "torch",
@@ -95,6 +96,15 @@ def test_tutorials(folder, device, page):
     """Run a tutorial, then its commands."""
     run(folder, RUN_PAGES, [(page.stem, blocks(page))], device)
     run(folder, RUN_COMMANDS, commands(page))
+
+
+@pytest.mark.parametrize(("page", "most"), GOALS.items())
+def test_tutorials_stay_short(page, most):
+    """The code of a tutorial has at most so many lines, of one statement each."""
+    text = "".join(code for _, code in BLOCK.findall((DOCS / "tutorials" / f"{page}.md").read_text()))
+    lines = [line for line in text.splitlines() if line.strip() and not line.strip().startswith("#")]
+    assert len(lines) <= most
+    assert not [line for line in lines if len(line) > 120 or ";" in line]
 
 
 def test_generated_blocks():

@@ -1,7 +1,7 @@
 """Pictures of the site: run scenes and tutorials, and store their pictures, made smaller, in tools/results/gallery.
 
 python tools/draw_gallery.py [--limit SECONDS] [NAME ...]    by default all scenes; scenes that take longer are left out
-python tools/draw_gallery.py --tutorials
+python tools/draw_gallery.py --tutorials [NAME ...]
 """
 
 import argparse
@@ -55,21 +55,25 @@ def draw_tutorial(page: Path) -> str:
         script = "\n".join(text for file, text in blocks if not file)
         plain = os.environ | {"MPLBACKEND": "agg"}
         subprocess.run([sys.executable, "-c", script], cwd=folder, env=plain, capture_output=True, check=True)
-        pictures = sorted(Path(folder).glob("*.png"))
-        for picture in pictures:
-            store(picture, f"tutorial_{picture.stem}")
-    return f"{len(pictures)} pictures"
+        pictures = {picture.stem: picture for picture in Path(folder).glob("*.png")}
+        pictures |= {picture.parent.name: picture for picture in Path(folder).glob("out/*/picture.png")}
+        shown = [name for name in sorted(pictures) if f"tutorial_{name}.png" in page.read_text()]
+        for name in shown:
+            store(pictures[name], f"tutorial_{name}")
+    return f"{len(shown)} pictures"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("scenes", nargs="*", metavar="NAME")
     parser.add_argument("--limit", type=float, default=120.0, help="longest run of a scene [s]")
-    parser.add_argument("--tutorials", action="store_true", help="the tutorials, not scenes")
+    parser.add_argument("--tutorials", action="store_true", help="the tutorials, or those named, not scenes")
     arguments = parser.parse_args()
     GALLERY.mkdir(exist_ok=True)
     if arguments.tutorials:
         for page in sorted(TUTORIALS.glob("*.md")):
+            if arguments.scenes and page.stem not in arguments.scenes:
+                continue
             print(f"{page.stem}: {draw_tutorial(page)}", flush=True)
         return
     for scene in arguments.scenes or scene_files():
