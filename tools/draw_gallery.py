@@ -56,7 +56,7 @@ def draw_tutorial(page: Path) -> str:
         plain = os.environ | {"MPLBACKEND": "agg"}
         subprocess.run([sys.executable, "-c", script], cwd=folder, env=plain, capture_output=True, check=True)
         pictures = {picture.stem: picture for picture in Path(folder).glob("*.png")}
-        pictures |= {picture.parent.name: picture for picture in Path(folder).glob("out/*/picture.png")}
+        pictures |= {f"{picture.parent.name}_run": picture for picture in Path(folder).glob("out/*/picture.png")}
         shown = [name for name in sorted(pictures) if f"tutorial_{name}.png" in page.read_text()]
         for name in shown:
             store(pictures[name], f"tutorial_{name}")
