@@ -65,7 +65,7 @@ def test_reference_is_run_once(cantilever, study, device, monkeypatch):
 
 
 def test_failed_case_has_no_error(cantilever, study, device, monkeypatch):
-    def fail(self, state, dt):
+    def fail(self, state, dt, controls):
         raise ddg.SolverError("rod 0 could not be stepped", state=state)
 
     monkeypatch.setattr(ddg.Integrator, "step", fail)

@@ -117,7 +117,7 @@ def test_failed_solver_keeps_complete_frames(fall, monkeypatch, capsys):
 
     step = Integrator.step
 
-    def fail(self, state, dt):
+    def fail(self, state, dt, controls):
         if state.time > 0.015:
             raise SolverError("rod 0 could not be stepped", state=state)
         return step(self, state, dt)

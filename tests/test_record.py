@@ -188,7 +188,7 @@ def test_a_failed_step_is_counted_once(device, tmp_path, monkeypatch):
     scene, options = scene_of("rods"), {"device": device, "progress": False, "usd": False}
     straight = simulate(scene, out=tmp_path / "straight", **options)
 
-    def step(self, state, dt, step=ddg.Integrator.step):
+    def step(self, state, dt, controls, step=ddg.Integrator.step):
         if state.time > 0.03:
             step(self, state, dt)
             raise ddg.SolverError("no more", state=state)
