@@ -47,26 +47,18 @@ def test_signatures(name):
     assert not bare
 
 
-def test_examples(tmp_path):
-    """Find no error in README and tutorials, and no `Any` in the names of this package that they use."""
+def test_types():
+    """Find no error in README and tutorials, and no `Any` in the names of this package that they use or that are public."""
     pytest.importorskip("mypy")
     pages = {page.stem: page.read_text() for page in [ROOT / "README.md", *TUTORIALS]}
-    errors, unclear = check(pages, tmp_path)
-    assert not errors, "\n".join(errors)
-    assert not unclear, "\n".join(unclear)
-
-
-def test_public_names(tmp_path):
-    """Find no `Any` in public signatures."""
-    pytest.importorskip("mypy")
     calls = [f"ddg.{call}" for name in ddg.__all__ for call in PUBLIC[name]]
-    text = "\n".join(["```python", "import ddg_warp as ddg", *calls, "```"])
-    errors, unclear = check({"public": text}, tmp_path)
+    pages["public"] = "\n".join(["```python", "import ddg_warp as ddg", *calls, "```"])
+    errors, unclear = check(pages)
     assert not errors, "\n".join(errors)
     assert not unclear, "\n".join(unclear)
 
 
-def check(pages: dict[str, str], folder: Path) -> tuple[list[str], list[str]]:
+def check(pages: dict[str, str]) -> tuple[list[str], list[str]]:
     """Return the errors of mypy in the examples of pages, and the names of this package with `Any` in their types."""
     from mypy import build
     from mypy.modulefinder import BuildSource
