@@ -18,7 +18,7 @@ try:
     from gymnasium.vector.utils import batch_space
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError(
-        "vector environments need gymnasium: `pip install 'ddg-warp[gym]'`", name=error.name
+        f"environments of gymnasium need {error.name}: `pip install 'ddg-warp[gym]'`", name=error.name
     ) from error
 
 from ddg_warp import argument_checks

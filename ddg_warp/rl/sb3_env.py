@@ -12,7 +12,7 @@ try:
     from stable_baselines3.common.vec_env import VecEnv
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError(
-        "environments of Stable-Baselines3 need stable_baselines3: `pip install 'ddg-warp[sb3]'`", name=error.name
+        f"environments of Stable-Baselines3 need {error.name}: `pip install 'ddg-warp[sb3]'`", name=error.name
     ) from error
 
 from ddg_warp.errors import SceneError
