@@ -119,7 +119,7 @@ class Model:
         """Name of the Warp device."""
         return str(self.wp_device)
 
-    def to(self, device) -> "Model":
+    def to(self, device: Device) -> "Model":
         """Return the model on a device: itself, or one built there with its current parameters and rest shapes.
 
         Raises:

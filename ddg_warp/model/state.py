@@ -14,7 +14,7 @@ from ddg_warp.errors import SceneError
 from ddg_warp.geometry import polyline
 from ddg_warp.scene.descriptions import Dynamics
 from ddg_warp.scene.handle import OBSTACLE, Handle
-from ddg_warp.typing import Array, Bools, Floats, Names
+from ddg_warp.typing import Array, Bools, Device, Floats, Names
 
 if TYPE_CHECKING:
     from ddg_warp.model.coupled_model import CoupledState
@@ -169,7 +169,7 @@ class State:
         size = f"{number(model.worlds, 'world')} of {number(model.points_count, 'point')}"
         return f"<State at {reached}: {size} on {model.device}>"
 
-    def to(self, device) -> "State":
+    def to(self, device: Device) -> "State":
         """Return the state itself, on the device of the model.
 
         Raises:

@@ -131,7 +131,7 @@ class SingleEnvironment(Episodes, gymnasium.Env):
 
     metadata = {"render_modes": RENDER_MODES}  # noqa: RUF012 - as of gymnasium
 
-    def __init__(self, environment: Environment, *arguments, **options):
+    def __init__(self, environment: Environment, *arguments: object, **options: object):
         super().__init__(environment, *arguments, **options)
         if environment.worlds != 1:
             raise SceneError(f"SingleEnvironment: {environment.worlds} worlds; give 1, or take a VectorEnvironment")
@@ -162,7 +162,7 @@ class VectorEnvironment(Episodes, VectorEnv):
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": RENDER_MODES}  # noqa: RUF012 - as of gymnasium
 
-    def __init__(self, environment: Environment, *arguments, **options):
+    def __init__(self, environment: Environment, *arguments: object, **options: object):
         super().__init__(environment, *arguments, **options)
         self.num_envs = environment.worlds
         self.single_action_space, self.single_observation_space = self.spaces()

@@ -31,7 +31,7 @@ class SB3Environment(VecEnv):
         options: arguments of `VectorEnvironment` for an `Environment`.
     """
 
-    def __init__(self, environment: Environment | VectorEnvironment, **options):
+    def __init__(self, environment: Environment | VectorEnvironment, **options: object):
         if isinstance(environment, VectorEnvironment) and options:
             raise SceneError(f"SB3Environment: {', '.join(options)} belong to the VectorEnvironment; give them there")
         envs = environment if isinstance(environment, VectorEnvironment) else VectorEnvironment(environment, **options)

@@ -12,11 +12,12 @@ from ddg_warp.argument_checks import meant
 from ddg_warp.errors import SceneError
 from ddg_warp.io.colors import CONTACT, OBSTACLE, PALETTE
 from ddg_warp.model.model import Model
-from ddg_warp.model.state import check_state
+from ddg_warp.model.state import State, check_state
 from ddg_warp.progress import progress_bar
 from ddg_warp.run.render import Canvas, View, missing, pyvista_module
 from ddg_warp.run.run_directory import RecordError, system_error
 from ddg_warp.run.simulate import Result
+from ddg_warp.typing import FilePath
 from ddg_warp.view.drawing import ARROW_LENGTH, Frame, arrows, colored
 from ddg_warp.view.player import initial_speed
 from ddg_warp.view.recording import NO_FIELD, Frames, Recording
@@ -30,10 +31,10 @@ MARGIN = 0.1  # height of the strips for texts over the height of the picture
 
 
 def movie(
-    source,
-    path: str | Path,
+    source: Model | Result | FilePath,
+    path: FilePath,
     *,
-    states: Sequence | None = None,
+    states: Sequence[State] | None = None,
     fps: float = 30.0,
     speed: float | None = None,
     size: tuple[int, int] = (1280, 720),

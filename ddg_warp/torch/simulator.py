@@ -99,7 +99,7 @@ class Simulator(torch.nn.Module):
         """Device of the tensors of states."""
         return torch.device(str(wp.device_to_torch(self.model.wp_device)))
 
-    def to(self, *arguments, **options) -> "Simulator":
+    def to(self, *arguments: object, **options: object) -> "Simulator":
         """Return the simulator itself, on the device and with the dtype of the model; see `torch.nn.Module.to`.
 
         Raises:
