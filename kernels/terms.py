@@ -11,12 +11,14 @@ from ddg_warp.kernels.densities import POSITIVE, Density, Parameter
 from ddg_warp.kernels.densities.contact import log_barrier, smooth_penalty
 from ddg_warp.kernels.densities.dipole import dipole_dipole, dipole_in_field
 from ddg_warp.kernels.densities.friction import logistic_friction, polynomial_friction
+from ddg_warp.kernels.densities.hinge import hinge_law
 from ddg_warp.kernels.densities.kelvin_voigt import damped
 from ddg_warp.kernels.densities.quadratic import quadratic
 from ddg_warp.kernels.densities.st_venant_kirchhoff import st_venant_kirchhoff
 from ddg_warp.kernels.measures import Measure
 from ddg_warp.kernels.measures.axisymmetric_curvature import axisymmetric_curvature, axisymmetric_rim
 from ddg_warp.kernels.measures.axisymmetric_metric import axisymmetric_metric
+from ddg_warp.kernels.measures.body_joint import hinge, separation
 from ddg_warp.kernels.measures.boundary_hinge_angle import edge_tilt
 from ddg_warp.kernels.measures.curvature_binormal import curvature_binormal
 from ddg_warp.kernels.measures.edge_stretch import edge_stretch, edge_stretch_2d
@@ -194,6 +196,8 @@ JOINTS = {
     for term in (
         Term("rigid_joint", joint_curvature_twist, quadratic, "bending and twist of half cells at rigid joints"),
         Term("rigid_joint", joint_curvature_twist_angle, quadratic, "rigid_joint, curvature by the turning angle"),
+        Term("ball_joint", separation, quadratic, "ball joints of rigid bodies, stiffness"),
+        Term("hinge", hinge, hinge_law, "hinges, motors and welds of rigid bodies, stiffness"),
     )
 }
 GLUE = Term("glued_edge", rod_surface_angle, quadratic, "what turns the edges of an attached rod with the shell")

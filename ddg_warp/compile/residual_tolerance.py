@@ -1,6 +1,6 @@
 """Residual tolerance: bound the error of internal forces relative to the load of the body.
 
-Every rod, shell and meridian is a *body* with the load scale W, the sum of its external forces alone. Clusters are single nodes, eight
+Every rod, shell, meridian and rigid body is a *body* with the load scale W, the sum of its external forces alone. Clusters are single nodes, eight
 nodes, eight such clusters, and so on: along a rod, or along a space-filling curve of a shell.
 
 - Rods and meridians: |sum of r| <= rtol W over every cluster bounds the error of the axial force by rtol W.
@@ -42,14 +42,15 @@ class ToleranceBodies:
     """Bodies of the coupled system, by which residuals are normalised.
 
     Attributes:
-        count: number of bodies: rods, shells, meridians.
+        count: number of bodies: rods, shells, meridians, rigid bodies.
         owner: body of each dof block (N,), the first where several are joined; arm: divisor of moments, 1 at nodes [m].
         levels: clusters, from small to large.
         shortest: length of the shortest rod, or root of the area of the smallest shell [m].
     """
 
     def __init__(self, host):
-        self.host, self.count = host, len(host.rods) + len(host.shells) + len(host.meridians)
+        rigid, structures = host.rigid_bodies, len(host.rods) + len(host.shells) + len(host.meridians)
+        self.host, self.count = host, structures + (len(rigid) if rigid else 0)
         blocks, body, fraction, arm, family = [], [], [], [], []
 
         def add(index, where, weights, length=1.0, sums=True):
@@ -73,13 +74,17 @@ class ToleranceBodies:
             add(index, shell.edges[turning], sides[turning] / areas.sum(), float(np.sqrt(areas.sum())), sums=False)
         for index, meridian in enumerate(host.meridians, len(lines) + len(host.shells)):
             add(index, meridian.nodes, 1.0)
+        lengths_of_bodies = rigid.lengths(host.mass) if rigid else np.zeros(0)
+        for index, length in enumerate(lengths_of_bodies):
+            add(structures + index, rigid.origins[[index]], 1.0)
+            add(structures + index, rigid.spins[[index]], 1.0, length)
         blocks, body, fraction, arm, family = (
             np.concatenate([np.zeros(0, type_), *values])
             for values, type_ in ((blocks, int), (body, int), (fraction, float), (arm, float), (family, int))
         )
         sizes = [length for *_, length in lines] + [np.sqrt(_areas(shell.surface).sum()) for shell in host.shells]
         sizes += [np.ptp(meridian.points, axis=0).max() for meridian in host.meridians]
-        self.shortest = float(min(sizes))
+        self.shortest = float(min(sizes or lengths_of_bodies))
         is_shell = (body >= len(lines)) & (body < len(lines) + len(host.shells))
         self._blocks, self._body = blocks, body
         self._line = np.concatenate([np.zeros(0, int), *(nodes for nodes, *_ in lines)])
@@ -87,23 +92,34 @@ class ToleranceBodies:
         self._weight = _weight(is_shell, fraction) * arm
         self.owner, self.arm = np.zeros(host.blocks, int), np.ones(host.blocks)
         self.owner[blocks[::-1]], self.arm[blocks[::-1]] = body[::-1], arm[::-1]
+        if rigid:
+            self.owner[rigid.centers] = structures + np.arange(len(rigid))
         self._spins(lines)
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
-        graph = coo_array((np.ones(len(blocks)), (blocks, host.blocks + body)), shape=(host.blocks + self.count,) * 2)
+        linked, links = blocks, body
+        if rigid:
+            linked, links = np.append(blocks, rigid.carried), np.append(body, structures + rigid.owner)
+        graph = coo_array((np.ones(len(linked)), (linked, host.blocks + links)), shape=(host.blocks + self.count,) * 2)
         self._component = connected_components(graph, directed=False)[1][host.blocks :]
         inside = family >= 0
         self.levels = _levels(
             blocks[inside], family[inside], body[inside], fraction[inside], arm[inside], is_shell[inside]
         )
 
+    @property
+    def _other_spins(self) -> np.ndarray:
+        """Rotation blocks of rigid bodies and of the world."""
+        rigid = self.host.rigid_bodies
+        return np.append(rigid.spins, rigid.world) if rigid else np.zeros(0, int)
+
     def _spins(self, lines: list) -> None:
         """Assign the rotations of rigid joints to the rods of the joint."""
         first = self.host.nodes + self.host.angles
         for part in self.host.sets if self.host.spins else ():
             spin = part.slots[(part.slots >= first).argmax(0), np.arange(len(part))]
-            joints = spin >= first
+            joints = (spin >= first) & ~np.isin(spin, self._other_spins)
             bodies = self.owner[part.slots[0][joints]]
             lengths = np.array([length for *_, length in lines])[bodies]
             self._blocks = np.append(self._blocks, spin[joints])
@@ -142,6 +158,8 @@ class ToleranceBodies:
         result = np.zeros(self.host.blocks)
         np.maximum.at(result, self._blocks, loads[self._body] * self._weight)
         result[self.host.of_obstacles] = 1.0  # of no body, and fixed
+        if self.host.rigid_bodies:
+            result[self.host.rigid_bodies.world] = 1.0
         return result
 
 

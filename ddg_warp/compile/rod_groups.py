@@ -133,9 +133,9 @@ def compile_rod_groups(scene: Scene, chosen: np.ndarray | None = None) -> list[R
     Raises:
         SceneError: the scene is invalid; the message names the object and its index.
     """
-    if not scene.batches and not scene.shells and not scene.axisymmetric_shells:
+    if not any((scene.batches, scene.shells, scene.axisymmetric_shells, scene.bodies)):
         raise SceneError(
-            "the scene has no rods and no shells; add some with scene.add_rods(points, section=..., material=...)"
+            "the scene has no rods, shells or bodies; add some with scene.add_rods(points, section=..., material=...)"
         )
     ghosts, laws = GhostNodes(scene), edge_forces.laws_of(scene)
     chosen = ~coupled_rods(scene) if chosen is None else chosen

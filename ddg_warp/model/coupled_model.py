@@ -14,6 +14,7 @@ from ddg_warp.kernels.elements import coupled_frames as frames
 from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.newton.rod_iterate import UPDATE_FRAMES
 from ddg_warp.model.parameters import ParameterTable
+from ddg_warp.model.rigid_bodies import RigidBodyTables
 from ddg_warp.model.rod_elements import RodElements
 from ddg_warp.model.user_forces import UserForceArrays
 
@@ -29,6 +30,8 @@ class CoupledState:
         lag: time-lagged rows of each element set (rows, W E).
         last: strains of each damped set at this state.
         data: data (rows, W E), by index, of sets in the magnetic field or with normals that supports rotate.
+        rotation, momentum: orientations of rigid bodies (W B,), columns are principal axes, and their angular momenta in space
+            (W B,) [kg m^2/s]; empty without bodies.
         rate: 1/h of the last step (W,) [1/s] if inertia entered its contact stiffness, else 0. Empty without such contact.
     """
 
@@ -40,6 +43,8 @@ class CoupledState:
     last: list[wp.array] = field(default_factory=list)
     data: dict[int, wp.array] = field(default_factory=dict)
     rate: wp.array | None = None
+    rotation: wp.array | None = None
+    momentum: wp.array | None = None
 
     def arrays(self) -> dict[str, wp.array]:
         """Return all arrays by name."""
@@ -48,6 +53,8 @@ class CoupledState:
             named |= {f"lag_{i}": lag, f"last_{i}": last}
         if self.rate is not None and len(self.rate):
             named["rate"] = self.rate
+        if self.rotation is not None and len(self.rotation):
+            named |= {"rotation": self.rotation, "momentum": self.momentum}
         return named | {f"data_{i}": data for i, data in self.data.items()}
 
 
@@ -178,6 +185,7 @@ class CoupledModel:
         self.world = wp.array(np.arange(worlds), dtype=int, device=device)
         self.still = wp.zeros(worlds, dtype=real, device=device)
         self.every = wp.full(worlds, 1, dtype=int, device=device)
+        self.bodies = RigidBodyTables(host.rigid_bodies, self) if host.rigid_bodies else None
 
     def has_quadratic_matrix(self, quadratic: bool) -> bool:
         """Return True if matrices take blocks with a stiffness: `quadratic` potentials or user-defined forces."""
@@ -204,6 +212,9 @@ class CoupledModel:
         state.data = self.turning_data() | self.field_data()
         heavy = self.host.contact_parameters and self.host.contact_parameters.inertia.any()
         state.rate = wp.zeros(self.worlds if heavy else 0, dtype=self.real, device=self.device)
+        count = self.worlds * (len(self.bodies) if self.bodies else 0)
+        state.rotation = wp.zeros(count, dtype=wp.types.matrix((3, 3), self.real), device=self.device)
+        state.momentum = wp.zeros(count, dtype=self.vector, device=self.device)
         return state
 
     @property
@@ -264,6 +275,8 @@ class CoupledModel:
         for part, lag in zip(self.sets, state.lag, strict=True):
             if len(part.host.lag):
                 lag.assign(np.tile(part.host.lag, (1, self.worlds)))
+        if self.bodies:
+            self.bodies.start(state)
         return state
 
     @property
@@ -336,7 +349,7 @@ class CoupledModel:
 
         Worlds that have not `moved` copy the data of `kept` instead. The states may be the same. Only launches: can be captured.
         """
-        if self.edges:
+        if self.edges or self.bodies:
             self._carry(before, after, after.q, kept or before, moved or self.every, 1, 0)
             self.reset_spins(after.q)
 
@@ -353,22 +366,35 @@ class CoupledModel:
         """Launch the frame and lag kernels of `kernels.elements.coupled_frames`."""
         real, serial = self.real, arrays.serial(self.device)
         inputs = [q, self.ends, self.blocks, moved, wanted, kept.frame, before.frame]
-        self.sweep(frames.edge_kernel(real, serial), inputs, [after.frame], self.edges)
+        if self.edges:
+            self.sweep(frames.edge_kernel(real, serial), inputs, [after.frame], self.edges)
         for index, (part, same, old, new) in enumerate(zip(self.sets, kept.lag, before.lag, after.lag, strict=True)):
             if part.term.measure.advance:
-                element_inputs = self.elements(after, index, q)
-                element_inputs.lag = old
-                kernel = frames.lag_kernel(part.term.measure, real, serial)
-                self.sweep(kernel, [element_inputs, moved, wanted, within, same], [new], part.elements)
+                self._update_lag(index, after, q, [moved, wanted, within, same], old, new)
+
+    def _update_lag(self, index: int, state, q: wp.array, inputs: list, old: wp.array, new: wp.array) -> None:
+        """Write the lagged rows of an element set from its `old` ones, the frames of a state and dofs q."""
+        part, element_inputs = self.sets[index], self.elements(state, index, q)
+        element_inputs.lag = old
+        kernel = frames.lag_kernel(part.term.measure, self.real, arrays.serial(self.device))
+        self.sweep(kernel, [element_inputs, *inputs], [new], part.elements)
+
+    def turn_ghosts(self, before: CoupledState, start: CoupledState, q: wp.array, moved: wp.array) -> None:
+        """Rotate ghosts of rigid joints and bodies in `start` from those of `before` by the rotation vectors in q, then zero these."""
+        for index, part in enumerate(self.sets):
+            if part.term.measure.spins:
+                self._update_lag(index, start, q, [moved, 1, 0, before.lag[index]], before.lag[index], start.lag[index])
+        self.reset_spins(q)
 
     @property
     def carries(self) -> list:
         """Kernels of `carry`, to load before a capture."""
-        if not self.edges:
+        if not (self.edges or self.bodies):
             return []
         real, serial = self.real, arrays.serial(self.device)
         kernels = [frames.lag_kernel(s.term.measure, real, serial) for s in self.sets if s.term.measure.advance]
-        return [*kernels, frames.edge_kernel(real, serial), *([frames.reset_kernel(real)] if self.host.spins else [])]
+        edges = [frames.edge_kernel(real, serial)] if self.edges else []
+        return [*kernels, *edges, *([frames.reset_kernel(real)] if self.host.spins else [])]
 
     def reset_spins(self, blocks: wp.array) -> None:
         """Zero the rotations of joints, or their rates."""

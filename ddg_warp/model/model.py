@@ -559,6 +559,7 @@ def needs_coupling(scene) -> bool:
         scene.shells,
         scene.joints,
         scene.attachments,
+        scene.bodies,
         scene.magnets,
         scene.axisymmetric_shells,
         scene.contact_settings,

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Snapshot: TypeAlias = dict[str, Array]  # name -> array
 
 EQUILIBRIUM = ("stable", "outcome", "unbalanced", "sliding")  # set by static solvers
-VELOCITIES = ("v", "omega", "a", "alpha")
+VELOCITIES = ("v", "omega", "a", "alpha", "momentum")
 
 
 @dataclass

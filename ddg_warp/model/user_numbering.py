@@ -76,7 +76,7 @@ class UserNumbering:
         rows = [start[rod.rod] + np.arange(len(rod.nodes)) for rod in host.rods]
         first = len(start) - 1 - len(host.meridians)
         rows += [start[first + i] + np.arange(len(shell.nodes)) for i, shell in enumerate(host.meridians)]
-        blocks = [body.nodes for body in (*host.rods, *host.meridians, *host.shells)]
+        blocks = [np.zeros(0, int), *(body.nodes for body in (*host.rods, *host.meridians, *host.shells))]
         vertices = sum(len(shell.nodes) for shell in host.shells)
         return np.concatenate([*rows, start[-1] + np.arange(vertices)]).astype(int), np.concatenate(blocks)
 

@@ -11,15 +11,17 @@ from ddg_warp.errors import SceneError
 from ddg_warp.typing import Integers
 
 ROD, SHELL, OBSTACLE, SUPPORT, LOAD = "rod", "shell", "obstacle", "support", "load"
+BODY = "body"
+BODY_JOINT = "body joint"
 SHELL_SUPPORT, RING_SUPPORT = "shell support", "ring support"
 AXISYMMETRIC = "shell of revolution"
 
 
 class Handle(int):
-    """Index of a rod, shell, support, load or obstacle of a scene, with kind and name.
+    """Index of a rod, shell, body, support, load or obstacle of a scene, with kind and name.
 
     Attributes:
-        kind: "rod", "shell", "shell of revolution", "obstacle", "support", "shell support", "ring support", "load", ...; the index
+        kind: "rod", "shell", "shell of revolution", "body", "obstacle", "support", "shell support", "ring support", "load", ...; the index
             counts the objects of one kind.
         name: as given to the scene, "" without.
     """

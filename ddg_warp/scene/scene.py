@@ -19,6 +19,7 @@ from ddg_warp.scene.handle import LOAD, ROD, SUPPORT, Handle, Handles, need
 from ddg_warp.scene.law import Law, laws_of
 from ddg_warp.scene.material import Material, Section, Stiffness, stiffness_of
 from ddg_warp.scene.prescribed_motion import Motion
+from ddg_warp.scene.rigid_bodies import RigidBodies
 from ddg_warp.scene.shells_and_joints import Structures
 from ddg_warp.scene.user_force import UserForces
 from ddg_warp.typing import Amplitude, Device, End, Integers, Numbers, Precision, Selection, Vector
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 @argument_checks.called
 @dataclass(kw_only=True, repr=False, eq=False)
-class Scene(Structures, Fields, UserForces):
+class Scene(Structures, RigidBodies, Fields, UserForces):
     """Description of rods and shells with supports and loads, from which `build` compiles a model.
 
     A model is independent of later changes of the scene.

@@ -17,7 +17,7 @@ from ddg_warp.scene.axisymmetric_shells import Meridians
 from ddg_warp.scene.contact import Contacts
 from ddg_warp.scene.descriptions import Attachment, EdgeCouple, Joint, Pressure, Shell, ShellLoad, ShellSupport
 from ddg_warp.scene.grip import Grip
-from ddg_warp.scene.handle import SHELL, SHELL_SUPPORT, Handle, need
+from ddg_warp.scene.handle import BODY, SHELL, SHELL_SUPPORT, Handle, need
 from ddg_warp.scene.law import Law, laws_of
 from ddg_warp.scene.magnets import Magnets
 from ddg_warp.scene.material import Material
@@ -333,16 +333,24 @@ class Structures(Meridians, Magnets, Contacts):
             raise SceneError("join_coincident: no nodes coincide at rest; give rods that cross or meet at nodes")
 
     def attach(
-        self, rod: int, nodes: Selection, shell: int, vertices: Selection, spin: Literal["glued", "free"] = "glued"
+        self,
+        rod: int,
+        nodes: Selection,
+        shell: int,
+        vertices: Selection | None = None,
+        spin: Literal["glued", "free"] | None = None,
+        frame: bool | None = None,
     ) -> None:
-        """Merge nodes of a rod with vertices of a shell, coincident at rest: a stiffener, a rim, a post.
+        """Merge nodes of a rod with vertices of a shell, coincident at rest; or let a rigid body carry nodes or vertices.
 
         Args:
-            rod: index.
-            nodes: of the rod.
-            shell: index.
-            vertices: as many as nodes.
-            spin: "glued" couples the twist of rod edges on mesh edges to the shell (rod-shell coupling). The directors of such an
+            rod: index; with a body also the handle of a shell.
+            nodes: of the rod, or vertices of the shell that a body carries.
+            shell: index; or the handle of a body, which carries the nodes from where they are at rest.
+            vertices: as many as nodes; none for a body.
+            frame: for a body: True (default) clamps the rod by its frame at the nodes, as a rigid joint does; False leaves a ball
+                joint. A shell has a ball joint at each vertex, so that two vertices leave a hinge.
+            spin: for a shell: "glued" (default) couples the twist of rod edges on mesh edges to the shell (rod-shell coupling). The directors of such an
                 edge rotate about it with the surface, at the same angle as at rest. Two triangles act by their mean,
                 which leaves the stiffness of a fold along the rod unchanged. "free" leaves the twist uncoupled.
 
@@ -352,8 +360,19 @@ class Structures(Meridians, Magnets, Contacts):
         rotate.
 
         Raises:
-            SceneError: an index out of range, not as many vertices as nodes, another `spin`; at `build`, points that do not coincide.
+            SceneError: an index out of range, not as many vertices as nodes, another `spin`; at `build`, points that do not coincide,
+                or a node that two bodies, or a body and a support, hold.
         """
+        if isinstance(shell, Handle) and shell.kind == BODY:
+            if vertices is not None or spin is not None:
+                raise SceneError(
+                    "attach: vertices and spin are for a shell; a body carries nodes as they are, with frame"
+                )
+            self._attach_to_body(rod, nodes, shell, True if frame is None else frame)
+            return
+        if vertices is None or frame is not None:
+            raise SceneError("attach: a shell takes vertices, and no frame, which is for the handle of a body")
+        spin = "glued" if spin is None else spin
         (rod,), nodes = self._on_rods("attach", argument_checks.index("attach: rod", rod), "node", nodes)
         vertices = self._vertices(shell, vertices)
         if len(nodes) != len(vertices):

@@ -247,16 +247,9 @@ ITEM = 16  # an item is element * ITEM + local node index
 
 
 @cache
-def balance_kernel(real, linear, quadratic: bool, contact: bool, serial: bool):
-    """Build the kernel of the residual.
-
-    `balance`: write residual and energy change of the blocks `some`, or of all if empty.
-    """
-    V, Meeting = wp.types.vector(3, real), meeting_type(real, linear)
-    Given, Found, F = inputs_type(real, quadratic), results_type(real, linear), wp.types.matrix((3, 3), real)
-    until = until_function(serial)
-    outer, settle = residual_functions(real, linear, quadratic, contact)
-    largest = largest_function(real)
+def elements_function(real, linear):
+    """Return the device function `add(...)`, which adds the contributions of all element sets to a block of a world."""
+    V, Meeting, largest = wp.types.vector(3, real), meeting_type(real, linear), largest_function(real)
 
     @wp.func
     def force_of(element_set: Meeting, local: int, e: int):
@@ -275,6 +268,62 @@ def balance_kernel(real, linear, quadratic: bool, contact: bool, serial: bool):
                     f[d] = f[d] - element_set.along[minus + d, e]
         return f
 
+    @wp.func
+    def add(
+        sets: wp.array(dtype=Meeting),
+        k: int,
+        w: int,
+        accepted: int,
+        force: V,
+        size: real,
+        stiff: real,
+        change: real,
+        rounding_error: real,
+    ):
+        """Return force, size, stiffness, energy change and its rounding with those of elements added.
+
+        The first local node of an element adds its energy.
+        """
+        for n in range(sets.shape[0]):
+            element_set = sets[n]
+            f = V()
+            large = real(0.0)
+            stiffness = linear(0.0)
+            more = real(0.0)
+            rounding = real(0.0)
+            for entry in range(element_set.starts[k], element_set.starts[k + 1]):
+                item = element_set.items[entry]
+                local = item % wp.static(ITEM)
+                e = item // wp.static(ITEM) + w * element_set.elements
+                g = force_of(element_set, local, e)
+                f += g
+                large += largest(g)
+                stiffness += element_set.stiffness[e]
+                if local == 0:
+                    new = element_set.energy[1 - accepted, e]
+                    more += new - element_set.energy[accepted, e]
+                    rounding += wp.abs(new)
+            force -= f
+            size += large
+            stiff += real(stiffness)
+            change += more
+            rounding_error += rounding
+        return force, size, stiff, change, rounding_error
+
+    return add
+
+
+@cache
+def balance_kernel(real, linear, quadratic: bool, contact: bool, serial: bool):
+    """Build the kernel of the residual.
+
+    `balance`: write residual and energy change of the blocks `some`, or of all if empty.
+    """
+    V, Meeting = wp.types.vector(3, real), meeting_type(real, linear)
+    Given, Found, F = inputs_type(real, quadratic), results_type(real, linear), wp.types.matrix((3, 3), real)
+    until = until_function(serial)
+    (outer, settle), add = residual_functions(real, linear, quadratic, contact), elements_function(real, linear)
+
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def balance(
         inputs: Given,
@@ -288,7 +337,7 @@ def balance_kernel(real, linear, quadratic: bool, contact: bool, serial: bool):
         total: int,
         outputs: Found,
     ):
-        """Treat `count` blocks in each world, `total` in all; the first local node of an element adds its energy.
+        """Treat `count` blocks in each world, `total` in all.
 
         `oblique`: index of a block's nodal frame among `frames` (skew supports), -1 for none; empty if no block has one.
         """
@@ -302,32 +351,9 @@ def balance_kernel(real, linear, quadratic: bool, contact: bool, serial: bool):
                 k = some[k]
             i = k + w * inputs.blocks
             force, size, stiff, change = outer(inputs, i, k, w, scalars[INERTIA_COEFFICIENT, w])
-            rounding_error = wp.abs(change)
-            accepted = flags[ENERGY_BUFFER, w]
-            for n in range(sets.shape[0]):
-                element_set = sets[n]
-                f = V()
-                large = real(0.0)
-                stiffness = linear(0.0)
-                more = real(0.0)
-                rounding = real(0.0)
-                for entry in range(element_set.starts[k], element_set.starts[k + 1]):
-                    item = element_set.items[entry]
-                    local = item % wp.static(ITEM)
-                    e = item // wp.static(ITEM) + w * element_set.elements
-                    g = force_of(element_set, local, e)
-                    f += g
-                    large += largest(g)
-                    stiffness += element_set.stiffness[e]
-                    if local == 0:
-                        new = element_set.energy[1 - accepted, e]
-                        more += new - element_set.energy[accepted, e]
-                        rounding += wp.abs(new)
-                force -= f
-                size += large
-                stiff += real(stiffness)
-                change += more
-                rounding_error += rounding
+            force, size, stiff, change, rounding_error = add(
+                sets, k, w, flags[ENERGY_BUFFER, w], force, size, stiff, change, wp.abs(change)
+            )
             if oblique.shape[0] > 0:
                 if oblique[k] >= 0:
                     force = frames[oblique[k]] * force

@@ -13,7 +13,7 @@ from ddg_warp.geometry.fundamental_forms import FREE as FREE_EDGE
 
 def add_masses(scene, coupled: CoupledSystem) -> None:
     """Lump masses and rotary inertia at the dofs."""
-    lumps = [(rod.all_nodes, rod.piece.mass[rod.row]) for rod in coupled.rods]
+    lumps = [(np.zeros(0, int), np.zeros(0)), *((rod.all_nodes, rod.piece.mass[rod.row]) for rod in coupled.rods)]
     for shell in coupled.shells:
         lumps.append((shell.nodes[shell.surface.triangles].ravel(), np.repeat(shell.corner_mass, 3)))
     for shell in coupled.meridians:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ddg_warp.compile import axisymmetric
 from ddg_warp.compile import shells as shell_terms
-from ddg_warp.compile.coupled import boundary_conditions, element_sets
+from ddg_warp.compile.coupled import boundary_conditions, element_sets, rigid_bodies
 from ddg_warp.compile.coupled.contact_parameters import contact_parameters
 from ddg_warp.compile.coupled.system import CoupledRod, CoupledShell, CoupledSystem
 from ddg_warp.compile.ghost_nodes import GhostNodes
@@ -32,7 +32,7 @@ def compile_coupled(scene, along: bool = False) -> CoupledSystem | None:
         SceneError: a joint, support or load is impossible; the message names the object.
     """
     chosen = coupled_rods(scene)
-    if not chosen.any() and not scene.shells and not scene.axisymmetric_shells:
+    if not chosen.any() and not scene.shells and not scene.axisymmetric_shells and not scene.bodies:
         return None
     if scene.shells and scene.dimension == 2:
         raise SceneError("a scene with shells has dimension 3; leave dimension=2 to rods")
@@ -49,6 +49,10 @@ def compile_coupled(scene, along: bool = False) -> CoupledSystem | None:
         builder.add_meridian(shell)
     for obstacle in scene.obstacles:
         builder.add_obstacle(obstacle)
+    for body in scene.bodies:
+        builder.add_body(body)
+    for joint in scene.body_joints:
+        builder.add_anchors(joint)
     return builder.finish()
 
 
@@ -78,6 +82,8 @@ class _Builder:
         self.meridians: list[np.ndarray] = []
         self.obstacles: list[np.ndarray] = []
         self.markers: list[np.ndarray] = []
+        self.bodies: list[np.ndarray] = []
+        self.anchors: list[np.ndarray] = []
         self.numbers: list[tuple[np.ndarray, np.ndarray]] = []  # (nodes, angles) of some rods
         self.rod_edges = 0
         self.frames: list[np.ndarray] = []
@@ -124,6 +130,14 @@ class _Builder:
         self.obstacles.append(self._number(points))
         self.markers.append(self._number(points[0] + radius * np.eye(3 if obstacle.spins else 0, 3)))
 
+    def add_body(self, body) -> None:
+        """Number the centre of a rigid body."""
+        self.bodies.append(self._number(body.center[None]))
+
+    def add_anchors(self, joint) -> None:
+        """Number the points of a joint between rigid bodies, which either body carries."""
+        self.anchors.append(self._number(np.array([joint.point, joint.point])))
+
     def _number(self, points: np.ndarray) -> np.ndarray:
         self.points.append(points)
         self.count += len(points)
@@ -164,7 +178,8 @@ class _Builder:
             third = plate.area * plate.thickness * material.density / 3.0
             shells.append(CoupledShell(surface, merged[numbers], angle, kinds, supports, plate, third))
         angles = self.rod_edges + mesh_edges
-        spins = sum(joint.rigid for joint in scene.joints)
+        joints = sum(joint.rigid for joint in scene.joints)
+        spins = joints + len(scene.bodies) + bool(scene.body_joints)
         rods = sorted(self.rods.values(), key=lambda rod: rod.rod)
         blocks = nodes + angles + spins
         coupled = CoupledSystem(
@@ -188,9 +203,17 @@ class _Builder:
             markers=[merged[numbers] for numbers in self.markers],
         )
         coupled.fixed[nodes : nodes + angles, 1:] = True
+        if scene.bodies:
+            centers, anchors = (
+                merged[np.concatenate([np.zeros(0, int), *numbers])] for numbers in (self.bodies, self.anchors)
+            )
+            places = centers, anchors.reshape(-1, 2), nodes + angles + joints
+            coupled.rigid_bodies = rigid_bodies.carried_nodes(scene, coupled, *places)
         coupled.sets = element_sets.element_sets(scene, coupled, self.along)
         boundary_conditions.add_masses(scene, coupled)
         boundary_conditions.hold(scene, coupled)
+        if scene.bodies:
+            rigid_bodies.take_masses(scene, coupled)
         boundary_conditions.load(scene, coupled)
         coupled.contact_parameters = contact_parameters(scene, coupled)
         if scene.dimension == 2:

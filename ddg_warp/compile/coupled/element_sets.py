@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 
 from ddg_warp.compile import axisymmetric, shells
+from ddg_warp.compile.coupled.body_joints import joint_sets
 from ddg_warp.compile.coupled.magnets import magnet_sets
 from ddg_warp.compile.coupled.rod_shell_coupling import glue_sets
 from ddg_warp.compile.coupled.system import CoupledRod, CoupledSet, CoupledSystem
@@ -20,9 +21,10 @@ from ddg_warp.kernels.terms import JOINTS, term_key
 
 def element_sets(scene, coupled: CoupledSystem, along: bool) -> list[CoupledSet]:
     """Return element sets by term, numbered `along` rods or not (`compile_coupled`); fix dofs without elements."""
-    joints = _joint_indices(scene, coupled)
+    joints = _joint_indices(scene, coupled) + _clamped_indices(scene, coupled)
     rods = [*_rod_sets(coupled, joints, along), *_joint_sets(coupled, joints), *glue_sets(scene, coupled)]
     magnets = magnet_sets(scene, coupled) if scene.magnets else []
+    magnets += joint_sets(scene, coupled) if scene.body_joints else []
     return _gather_sets([*rods, *magnets, *_shell_sets(coupled, scene), *_meridian_sets(coupled, scene)])
 
 
@@ -42,14 +44,40 @@ def _joint_indices(scene, coupled: CoupledSystem) -> list[tuple[int, int, list, 
                     f"rigid joint {number}: rod {index} bends by a law of its own, and half cells at joints know the quadratic one; "
                     "give the joint a law with join(laws={'rigid_joint': Law(...)}), or join it with rigid=False"
                 )
-            k = rod.first + (local_node if local_node >= 0 else len(rod.nodes) + local_node)
-            node = rod.all_nodes[k]
-            count, closed = len(rod.all_nodes), rod.piece.kind.closed
-            if closed or k < count - 1:
-                members.append((rod, k, 1.0))
-            if closed or k > 0:
-                members.append((rod, (k - 1) % count, -1.0))
+            node, edges = _adjacent_edges(rod, local_node)
+            members += edges
         result.append((node, coupled.nodes + coupled.angles + number, members, joint.laws))
+    return result
+
+
+def _adjacent_edges(rod: CoupledRod, local_node: int) -> tuple[int, list]:
+    """Return the dof block of a node, and its edges as (rod, edge with ghosts, sign)."""
+    k = rod.first + (local_node if local_node >= 0 else len(rod.nodes) + local_node)
+    count, closed, edges = len(rod.all_nodes), rod.piece.kind.closed, []
+    if closed or k < count - 1:
+        edges.append((rod, k, 1.0))
+    if closed or k > 0:
+        edges.append((rod, (k - 1) % count, -1.0))
+    return rod.all_nodes[k], edges
+
+
+def _clamped_indices(scene, coupled: CoupledSystem) -> list[tuple[int, int, list, Mapping]]:
+    """Return the nodes that rigid bodies clamp, as `_joint_indices` returns rigid joints."""
+    by_rod = {rod.rod: rod for rod in coupled.rods}
+    result = []
+    for link in scene.body_attachments:
+        for local_node in link.nodes.tolist() if link.clamped else ():
+            rod = by_rod[link.index]
+            for reason, holds in (
+                ("has no twist", not rod.edges.size),
+                ("bends by a law of its own", "rod_bend_twist" in rod.piece.batch.laws),
+            ):
+                if holds:
+                    raise SceneError(
+                        f"attach: rod {link.index} {reason}, and body {link.body} cannot clamp it; attach it with frame=False"
+                    )
+            node, edges = _adjacent_edges(rod, local_node)
+            result.append((node, coupled.rigid_bodies.spins[link.body], edges, {}))
     return result
 
 

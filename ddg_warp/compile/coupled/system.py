@@ -12,6 +12,7 @@ import numpy as np
 from ddg_warp.compile import axisymmetric
 from ddg_warp.compile import shells as shell_terms
 from ddg_warp.compile.collision_bodies import ContactParameters
+from ddg_warp.compile.coupled.rigid_bodies import RigidBodyArrays
 from ddg_warp.compile.coupled.rod_ordering import RodOrder, rod_order
 from ddg_warp.compile.dof_map import DofStorage, RodDofMap, RodIndexMap
 from ddg_warp.compile.loads import accumulate
@@ -98,6 +99,7 @@ class CoupledSystem(DofStorage):
         obstacles: nodes of each obstacle, all fixed.
         markers: carried nodes of each rotating surface, at one radius from its first node along x, y and z at rest.
         contact_parameters: contact, None without.
+        rigid_bodies: rigid bodies, None without.
         frames: nodal frames, orthonormal rows (3, 3), of nodes on skew supports, by node; see `compile.coupled.skew_supports`.
     """
 
@@ -118,6 +120,7 @@ class CoupledSystem(DofStorage):
     markers: list[np.ndarray] = field(default_factory=list)
     contact_parameters: ContactParameters | None = None
     frames: dict[int, np.ndarray] = field(default_factory=dict)
+    rigid_bodies: RigidBodyArrays | None = None
 
     @property
     def blocks(self) -> int:
@@ -226,12 +229,13 @@ class CoupledSystem(DofStorage):
         """Nodes of edges under the rotation cap (E, 2): rods, meshes, meridians; without any, of all elements."""
         shells, meridians = (s.nodes[s.surface.edges] for s in self.shells), (m.ends for m in self.meridians)
         edges = np.concatenate([self.ends, *shells, *meridians])
-        return edges if len(edges) else np.concatenate([part.slots[:2].T for part in self.sets])
+        return edges if len(edges) or self.rigid_bodies else np.concatenate([part.slots[:2].T for part in self.sets])
 
     @cached_property
     def edge_lengths(self) -> np.ndarray:
         """Rest lengths of `edges` (E,) [m]."""
-        return np.linalg.norm(np.diff(self.rest[self.edges], axis=1)[:, 0], axis=1)
+        lengths = np.linalg.norm(np.diff(self.rest[self.edges], axis=1)[:, 0], axis=1)
+        return lengths if len(lengths) else np.array([self.bodies.shortest])
 
     @cached_property
     def pieces(self) -> list[tuple]:

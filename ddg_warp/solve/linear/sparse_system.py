@@ -8,6 +8,7 @@ from ddg_warp.errors import SceneError
 from ddg_warp.kernels.linear import coupled_pcg, sliced_ell
 from ddg_warp.kernels.linear.sliced_ell import SLICE
 from ddg_warp.kernels.residual.coupled_residual import ITEM
+from ddg_warp.solve.linear.condensation import CondensationPlan
 from ddg_warp.timers import timer
 
 
@@ -25,6 +26,8 @@ class SparseSystem:
         `slices`: offset of each slice.
         angles: first block of a twist angle, and the first one after all of them; has_angles: True if there are any.
         `diagonal`: position of each H_ii, -1 if in bands or left out.
+        condensed: arrays of `kernels.rigid_bodies.condensation.condense_kernel` by name; None without rigid bodies. Entries of carried
+            nodes follow the slices, and take no part in products.
         `meets`, `adds`: incidence lists (offsets, items) of each element set, by blocks and by positions.
     """
 
@@ -32,42 +35,66 @@ class SparseSystem:
         blocks, device = coupled.blocks, coupled.device
         self.angles = coupled.host.nodes, blocks - coupled.host.spins
         self.has_angles = self.angles[0] < self.angles[1]
-        out = None if kept is None else coupled.host.fixed.all(1)
+        rigid, raw_blocks = coupled.host.rigid_bodies, np.zeros(blocks, bool)
+        if rigid:
+            raw_blocks[rigid.carried] = True
+        out = None if kept is None else coupled.host.fixed.all(1) & ~raw_blocks
         pairs = [_pairs(element_set.host, kept, out) for element_set in coupled.sets]
         diagonal_blocks = np.arange(blocks) if kept is None else np.flatnonzero(~(kept | out))
         row = np.concatenate([*(rows for rows, *_ in pairs), diagonal_blocks]).astype(np.int32)
         column = np.concatenate([*(columns for _, columns, _ in pairs), diagonal_blocks]).astype(np.int32)
-        order = lists(column, blocks)[1]
-        order = order[lists(row[order], blocks)[1]]  # by rows and, of one row, by columns
-        row, column = row[order], column[order]
-        first = (np.diff(row, prepend=-1) != 0) | (np.diff(column, prepend=-1) != 0)
-        inverse = np.empty(len(order), int)
-        inverse[order] = np.cumsum(first) - 1
-        row, column = row[first], column[first]
-        slices, position = slice_rows(row, blocks)
-        self.positions = int(slices[-1])
+        raw = raw_blocks[row] | raw_blocks[column]
+        raw_index, raw_row, raw_column = unique_entries(row[raw], column[raw], blocks)
+        entry_row, entry_column, plan = row[~raw], column[~raw], None
+        if rigid:
+            plan = CondensationPlan(rigid, raw_row, raw_column, np.zeros(blocks, bool) if out is None else out)
+            entry_row, entry_column = np.append(entry_row, plan.rows), np.append(entry_column, plan.columns)
+        index, entry_row, entry_column = unique_entries(entry_row, entry_column, blocks)
+        slices, position = slice_rows(entry_row, blocks)
+        first_raw = int(slices[-1])
+        self.positions = first_raw + len(raw_row)
         if self.positions * coupled.worlds >= 2**31:
             raise SceneError(
                 "the coupled system is too large: its matrix has more than 2^31 entries; build fewer worlds at once"
             )
+        targets = np.empty(len(row), int)
+        targets[~raw], targets[raw] = position[index[: np.count_nonzero(~raw)]], first_raw + raw_index
         rows, columns = np.full(self.positions, -1), np.full(self.positions, -1)
-        rows[position], columns[position] = row, column
+        rows[position], columns[position] = entry_row, entry_column
+        rows[first_raw:], columns[first_raw:] = raw_row, raw_column
 
         def put(values):
             return wp.array(np.ascontiguousarray(values, np.int32), dtype=int, device=device)
 
         self.rows, self.columns, self.slices = put(rows), put(columns), put(slices)
         diagonal = np.full(blocks, -1)
-        diagonal[row[row == column]] = position[row == column]
-        self.diagonal, self.entries = put(diagonal), len(row)
+        on_diagonal = entry_row == entry_column
+        diagonal[entry_row[on_diagonal]] = position[on_diagonal]
+        self.diagonal, self.entries = put(diagonal), len(entry_row)
+        self.condensed = None
+        if plan:
+            keys = entry_row.astype(np.int64) * blocks + entry_column
+            raw_position = first_raw + np.arange(len(raw_row))
+            self.condensed = {n: put(v) for n, v in plan.bind(keys, position, raw_position, blocks).items()}
         begin, self.adds, self.meets = 0, [], []
         for element_set, (rows, _, pair_indices) in zip(coupled.sets, pairs, strict=True):
-            targets, begin = position[inverse[begin : begin + len(rows)]], begin + len(rows)
-            starts, items = lists(targets, self.positions)
+            own_targets, begin = targets[begin : begin + len(rows)], begin + len(rows)
+            starts, items = lists(own_targets, self.positions)
             self.adds.append((put(starts), put(items if pair_indices is None else pair_indices[items])))
             starts, items = lists(element_set.host.slots.T.ravel(), blocks)
             element, local = np.divmod(items, len(element_set.host.slots))
             self.meets.append((put(starts), put(element * ITEM + local)))
+
+
+def unique_entries(row: np.ndarray, column: np.ndarray, blocks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the index of every entry among the unique ones, and rows and columns of these, sorted by rows, then columns."""
+    order = lists(column, blocks)[1]
+    order = order[lists(row[order], blocks)[1]]
+    row, column = row[order], column[order]
+    first = (np.diff(row, prepend=-1) != 0) | (np.diff(column, prepend=-1) != 0)
+    index = np.empty(len(order), int)
+    index[order] = np.cumsum(first) - 1
+    return index, row[first], column[first]
 
 
 def slice_rows(row: np.ndarray, blocks: int) -> tuple[np.ndarray, np.ndarray]:

@@ -141,6 +141,12 @@ class SubstructuringPlan:
         spins = [element_set.slots[[0, 3]].T for element_set in host.sets if element_set.term.measure.spins]
         rotations = np.unique(np.concatenate(spins), axis=0) if spins else np.zeros((0, 2), int)
         is_joint = np.bincount(node, minlength=host.blocks) > 1
+        if host.rigid_bodies:  # a body is a joint of its centre and its rotation
+            bodies = host.rigid_bodies
+            own = np.column_stack([bodies.origins, bodies.spins])
+            others = ~np.isin(rotations[:, 1], np.append(bodies.spins, bodies.world))
+            rotations = np.concatenate([rotations[others], own])
+            is_joint[bodies.carried] = True
         is_joint[rotations[:, 0]] = True
         rotation = np.full(host.blocks, -1)
         rotation[rotations[::-1, 0]] = rotations[::-1, 1]

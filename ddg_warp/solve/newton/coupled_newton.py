@@ -28,6 +28,7 @@ from ddg_warp.solve.newton.line_search import LineSearch
 from ddg_warp.solve.newton.relaxed_convergence import RelaxedConvergence
 from ddg_warp.solve.newton.residual import ResidualAssembler
 from ddg_warp.solve.newton.residual_tolerance import ResidualTolerances
+from ddg_warp.solve.newton.rigid_bodies import RigidBodies
 from ddg_warp.solve.newton.rod_newton import FROZEN, FROZEN_ONLY, NewtonOptions
 from ddg_warp.solve.newton.sleeping_islands import SleepingIslands
 from ddg_warp.timers import timer
@@ -54,7 +55,7 @@ class CoupledNewton:
 
     Attributes:
         `sparsity`, `substructuring`: `SparseSystem` and, with substructuring, `RodSubstructuring`.
-        `frozen`, `planes`, `edge_rotations`, `contact`, `sleeping`, `relaxed`: components that not all models and options need, or
+        `frozen`, `planes`, `edge_rotations`, `contact`, `sleeping`, `relaxed`, `rigid_bodies`: components that not all models and options need, or
             None.
         krylov: conjugate gradients; None if substructuring is exact.
     """
@@ -89,6 +90,10 @@ class CoupledNewton:
         if coupled.user_forces and reuse:
             raise SceneError(
                 "user-defined forces: solver 'projective' keeps the matrix of a step, which they change; use 'newton'"
+            )
+        if host.rigid_bodies and reuse:
+            raise SceneError(
+                "rigid bodies: solver 'projective' keeps the matrix of a step, which they change; use 'newton'"
             )
         self.islands = Islands(coupled.worlds, real, coupled.device)
         self.frozen = FrozenHessian(self.islands) if reuse else None
@@ -150,6 +155,13 @@ class CoupledNewton:
             quadratic,
         )
         most = int(options.unconverged_fraction * self.contact.touching_bodies) if self.contact else 0
+        self.rigid_bodies = None
+        if coupled.bodies:
+            stiffened = coupled.has_quadratic_matrix(quadratic)
+            self.rigid_bodies = RigidBodies(
+                coupled.bodies, self.sparsity, self.linear, quadratic, stiffened, outer is not None
+            )
+            self.residual.leave_out(self.rigid_bodies)
         self.line_search = LineSearch(coupled, self.linear, most > 0)
         self._worst = Sums(coupled.worlds, self.tolerances.ratio.shape[1], real, coupled.device, largest=True)
         lengthened = self.substructuring if any(self.elements.mixed_axial) else None
@@ -226,6 +238,7 @@ class CoupledNewton:
             self.contact,
             self.sleeping,
             self.user_forces,
+            self.rigid_bodies,
         )
         kernels = [kernel for part in (*parts, self.relaxed) if part for kernel in part.kernels]
         return [*kernels, *self.coupled.carries, *([self._repeat] if self._repeat else [])]
@@ -265,6 +278,8 @@ class CoupledNewton:
         """Advance active worlds to the next iterate."""
         wp.capture_if(self.islands.any_needs_direction, self._find_direction)
         self.line_search.move(self.iterates, self.system, self.islands)
+        if self.rigid_bodies:
+            self.rigid_bodies.place(self.iterates, self.islands)
         if self.edge_rotations:
             wp.capture_if(self.islands.any_edge_rotation, lambda: self._rotate(state))
         if self.contact:
@@ -330,6 +345,8 @@ class CoupledNewton:
     def _assemble_elements(self) -> None:
         matrix, mass, updated_islands = self.system.matrix, self.inertia, self.updated_islands
         self._assembly(mass, updated_islands, matrix)
+        if self.rigid_bodies:
+            self.rigid_bodies.condense(mass, updated_islands, matrix)
         if self.planes:
             self.planes.matrix(matrix, updated_islands.needs_direction)
         if self.substructuring and not self.exact:
@@ -365,6 +382,8 @@ class CoupledNewton:
 
     def measure_rotation(self) -> None:
         """Compute the largest squared rotation of the directions, transformed to spatial components."""
+        if self.rigid_bodies:
+            self.rigid_bodies.spread(self.system)
         if self.planes:
             self.planes.back(self.system.direction, self.system.wanted)
         self.line_search.measure_rotation(self.iterates, self.search_state, self.system)

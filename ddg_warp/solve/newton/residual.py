@@ -55,9 +55,9 @@ class ResidualAssembler:
         # an array of structures keeps no member alive
         self._meetings = list(_contributions(coupled, elements, sparsity, linear))
         self._sets = wp.array(self._meetings, dtype=coupled_residual.meeting_type(real, linear), device=coupled.device)
-        off_path_blocks = self.bands.elsewhere if self.bands else np.arange(0)
-        self._some = wp.array(off_path_blocks.astype(np.int32), dtype=int, device=coupled.device)
-        self._count = len(off_path_blocks) if self.bands else coupled.blocks
+        self._rigid_bodies = None
+        self._take(self.bands.elsewhere if self.bands else np.arange(0))
+        self._count = len(self._some) if self.bands else coupled.blocks
         types = int, wp.types.matrix((3, 3), real)
         self._frames = (
             [planes.of_blocks, planes.frames[real]]
@@ -66,6 +66,18 @@ class ResidualAssembler:
         )
         serial = device_arrays.serial(coupled.device)
         self.kernels = [coupled_residual.balance_kernel(real, linear, quadratic, outer is not None, serial)]
+
+    def _take(self, blocks: np.ndarray) -> None:
+        """Set the blocks that the residual kernel treats; all if empty."""
+        self._some = wp.array(blocks.astype(np.int32), dtype=int, device=self.coupled.device)
+
+    def leave_out(self, rigid_bodies) -> None:
+        """Leave the blocks of bodies to `RigidBodies`."""
+        host, self._rigid_bodies = rigid_bodies.tables.host, rigid_bodies
+        blocks = self._some.numpy() if self.bands else np.arange(self.coupled.blocks)
+        blocks = np.setdiff1d(blocks, np.concatenate([host.origins, host.spins, host.carried]))
+        self._take(blocks)
+        self._count = len(blocks)
 
     def __call__(self, iterates, loading, norms, system, islands) -> None:
         """Assemble the residuals at the iterate, with norms."""
@@ -83,6 +95,8 @@ class ResidualAssembler:
             [outputs],
             self.coupled.device,
         )
+        if self._rigid_bodies:
+            self._rigid_bodies.balance(inputs, self._sets, islands, outputs)
 
 
 def _contributions(coupled, elements, sparsity, linear):

@@ -16,7 +16,6 @@ from ddg_warp.kernels.core import outcome
 from ddg_warp.kernels.elements import coupled_frames, element_path
 from ddg_warp.kernels.elements.coupled_element import coupled_storage
 from ddg_warp.kernels.stepping import time_step
-from ddg_warp.model.coupled_model import CoupledState
 from ddg_warp.scene.edge_forces import HOLD, holds
 from ddg_warp.solve.collision.support_arcs import Arcs
 from ddg_warp.solve.equilibrium.tangent import Tangent
@@ -27,6 +26,7 @@ from ddg_warp.solve.linear.solver_selection import coupled_preconditioner
 from ddg_warp.solve.newton.coupled_newton import PRECONDITIONERS, CoupledNewton
 from ddg_warp.solve.stepping.decoupled_step import DecoupledStep, is_decoupled, rods_of, uncoupled
 from ddg_warp.solve.stepping.energy_drift import CoupledEnergy
+from ddg_warp.solve.stepping.rigid_bodies import RigidBodyStep
 from ddg_warp.solve.stepping.step_driver import USUAL, StepDriver
 from ddg_warp.solve.stepping.warm_start import WarmStart
 from ddg_warp.timers import timer
@@ -87,7 +87,7 @@ class CoupledStep(StepDriver):
             )
         if solver.user_forces and self.midpoint:
             raise SceneError("user-defined forces: the midpoint rule does not evaluate them; use 'implicit_euler'")
-        self._lagged = model.coupled.lagged() if model.coupled.edges else None
+        self._lagged = model.coupled.lagged() if model.coupled.edges or host.rigid_bodies else None
         self._take = coupled_frames.take_kernel(real)
         self.motion = CoupledMotion(model, self.midpoint) if host.moves else None
         loads = None
@@ -97,6 +97,7 @@ class CoupledStep(StepDriver):
         self.forces = forces_of(model, self.coupled, self.midpoint, loads)
         if solver.user_forces:
             self.forces.append(solver.user_forces)
+        self.bodies = RigidBodyStep(model, solver, self.midpoint) if solver.rigid_bodies else None
         self.energy = CoupledEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.arcs = self._resolve_arcs()
         self.field = CoupledField(model, self.midpoint, integrator.field)
@@ -177,6 +178,8 @@ class CoupledStep(StepDriver):
     def prescribe(self, t0: float, t1: float) -> None:
         """Upload supports, loads, magnetic field and flow between t0 and t1."""
         super().prescribe(t0, t1)
+        if self.bodies:
+            self.bodies.drives.upload(t0, t1)
         if self.decoupled:
             self.decoupled.prescribe(t0, t1)
         if self.arcs:
@@ -258,6 +261,8 @@ class CoupledStep(StepDriver):
         )
         if self.motion:
             self.motion.place(islands, iterates.q)
+        if self.bodies:
+            self.bodies.predict(before)
         if solver.edge_rotations:
             solver.edge_rotations.predict(before.v, not self.midpoint, iterates, system, islands)
         start = self._start_frames(before)
@@ -268,6 +273,8 @@ class CoupledStep(StepDriver):
     def warm_start(self, before) -> None:
         """Warm-start from the predictor by the last correction, and store the start."""
         self._foresight.start(before)
+        if self.bodies:
+            self.newton.rigid_bodies.place(self.newton.iterates, self.islands)
 
     def solve(self, start) -> None:
         """Launch Newton's method."""
@@ -288,6 +295,8 @@ class CoupledStep(StepDriver):
             [coupled.node_state(after), points(after.a), None, after.rate],
             device=self.model.wp_device,
         )
+        if self.bodies:
+            self.bodies.finish(before, after)
 
     def complete(self, start, before, after) -> None:
         """Update frames, magnetic field and strains to the positions."""
@@ -306,18 +315,24 @@ class CoupledStep(StepDriver):
         the whole half step. Rotating support normals and the magnetic field belong to the solve. Finished worlds keep the frames of
         their solve, from which gradients detect a frame update.
         """
-        if not self.coupled.edges:
+        if self._lagged is None:
             return replace(before, data=self._data)
         frame, lag = self._lagged
-        start = CoupledState(self.newton.iterates.q, before.v, before.a, frame, lag, before.last, self._data)
+        iterate = {"q": self.newton.iterates.q, "frame": frame, "lag": lag, "data": self._data}
+        start = replace(before, **iterate)
         if self.midpoint:
+            if self.bodies:
+                self.bodies.turn(before)
             self.coupled.carry(before, start, kept=start, moved=self.islands.substep_accepted)
             return start
         inputs = [self.islands.substep_accepted, self.coupled.edges, before.frame]
-        wp.launch(self._take, frame.shape[1], inputs, [frame], device=self.model.wp_device)
+        edges = self.coupled.edges and frame.shape[1]
+        wp.launch(self._take, edges, inputs, [frame], device=self.model.wp_device)
         for part, target, source in zip(self.coupled.sets, lag, before.lag, strict=True):
             if part.term.measure.advance:
                 wp.copy(target, source)
+        if self.bodies:
+            self.bodies.turn_ghosts(before, start)
         return start
 
     @property
@@ -325,6 +340,7 @@ class CoupledStep(StepDriver):
         """Kernels of an attempt, without the solver's."""
         real, coupled = self.model.types.real, self.coupled
         kernels = [self._begin, self._finish, self._take, *([] if self.midpoint else self._foresight.kernels)]
+        kernels += self.bodies.kernels if self.bodies else []
         for part in coupled.sets:
             if part.term.density.lagged:
                 kernels.append(element_path.strain_kernel(coupled_storage(part.term, real), real))

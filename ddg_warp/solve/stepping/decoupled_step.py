@@ -284,7 +284,7 @@ def uncoupled(model) -> bool:
     host, scene = model.coupled.host, model.scene
     if not host.contact_parameters or not host.rods or any(rod.piece.kind.closed for rod in host.rods):
         return False
-    joined = scene.shells, scene.axisymmetric_shells, scene.joints, scene.attachments, scene.magnets
+    joined = scene.shells, scene.axisymmetric_shells, scene.joints, scene.attachments, scene.bodies, scene.magnets
     return not any((*joined, scene.user_forces))
 
 

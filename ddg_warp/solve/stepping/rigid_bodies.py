@@ -1,0 +1,64 @@
+"""Rigid bodies in time steps of the coupled system: flight before a solve, poses and momenta after it."""
+
+import warp as wp
+
+from ddg_warp.kernels.rigid_bodies import motion
+from ddg_warp.solve.stepping.joint_drives import JointDrives
+
+
+class RigidBodyStep:
+    """Flight and end of a step of the rigid bodies of a `CoupledStep`; see `kernels.rigid_bodies.motion`.
+
+    Args:
+        newton: `CoupledNewton`, with its `RigidBodies`.
+
+    Attributes:
+        drives: angles and torques of hinges.
+    """
+
+    def __init__(self, model, newton, midpoint: bool):
+        self.drives = JointDrives(model, midpoint)
+        self.newton, self.bodies, self.tables = newton, newton.rigid_bodies, newton.rigid_bodies.tables
+        self.coupled, real = newton.coupled, newton.coupled.real
+        self._predict, self._turn = motion.predict_kernel(real, midpoint), motion.turn_kernel(real)
+        self._finish = motion.finish_kernel(real, midpoint)
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [self._predict, self._turn, self._finish, *self.tables.kernels]
+
+    def predict(self, before) -> None:
+        """Find the orientations after the flight, and place carried nodes there."""
+        tables, islands = self.tables, self.newton.islands
+        inputs = [before.rotation, before.momentum, tables.moments, len(tables), islands.arrays[1]]
+        self._launch(self._predict, inputs, [self.bodies.predicted, self.bodies.bodies.inertia])
+        self.bodies.place(self.newton.iterates, islands)
+
+    def turn(self, before) -> None:
+        """Write the rotation vectors of the flight from a state `before` into the iterate."""
+        inputs = [before.rotation, self.bodies.predicted, self.tables.spins, self.coupled.blocks]
+        self._launch(self._turn, inputs, [self.newton.iterates.q])
+
+    def turn_ghosts(self, before, start) -> None:
+        """Rotate the ghosts of clamped rods from the state `before` with the flight, into the lagged data of `start`."""
+        q = self.newton.iterates.q
+        self.turn(before)
+        self.coupled.turn_ghosts(before, start, q, self.newton.islands.substep_accepted)
+
+    def finish(self, before, after) -> None:
+        """Write poses and momenta at the end of accepted substeps, with carried nodes."""
+        newton, tables = self.newton, self.tables
+        inputs = [
+            newton.iterates.q,
+            self.bodies.predicted,
+            self.bodies.bodies.inertia,
+            before.rotation,
+            before.momentum,
+        ]
+        inputs += [tables.spins, self.coupled.blocks, *newton.islands.arrays]
+        self._launch(self._finish, inputs, [after.rotation, after.momentum, after.q])
+        tables.carry(after)
+
+    def _launch(self, kernel, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, (self.coupled.worlds, len(self.tables)), inputs, outputs, device=self.coupled.device)

@@ -1,0 +1,177 @@
+"""Condensation of carried nodes onto the dofs of their rigid bodies: residuals and matrix.
+
+With dx = dc + D dw of a carried node, force f and stiffness K on it act on the body as
+
+    f_c += f ,   f_w += D^T f ,   K_cc += K ,   K_cw += K D ,   K_ww += D^T K D ,
+
+and couplings with other blocks alike. D^T f is T^T (y x f), see `kernels.rigid_bodies.motion`. The second derivative of the rotation,
+f . d^2 x / dw^2, is left out, as other second derivatives are in the Gauss-Newton matrix.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from ddg_warp.kernels.core.inertia import mass_type
+from ddg_warp.kernels.core.islands import ENERGY_BUFFER, INERTIA_COEFFICIENT, LOAD_SCALE, NEEDS_DIRECTION, STATUS
+from ddg_warp.kernels.core.launch import CPU_OPTIONS
+from ddg_warp.kernels.linear.sliced_ell import inertia_function
+from ddg_warp.kernels.residual.coupled_residual import (
+    elements_function,
+    inputs_type,
+    meeting_type,
+    residual_functions,
+    results_type,
+)
+
+PLAIN = -1  # of `left` and `right`: the side of a block that D does not multiply
+
+
+@cache
+def bodies_type(real):
+    """Return the struct of rigid bodies, for kernels of solves.
+
+    `origins`, `spins`, `carried`, `owner`, `starts`: see `ddg_warp.compile.coupled.rigid_bodies`. `y`, `derivative`: y and D of
+    carried nodes (W C,). `inertia`: gamma P I P^T (W B,).
+    """
+    V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
+
+    @wp.struct
+    class Bodies:
+        origins: wp.array(dtype=int)
+        spins: wp.array(dtype=int)
+        carried: wp.array(dtype=int)
+        starts: wp.array(dtype=int)
+        y: wp.array(dtype=V)
+        derivative: wp.array(dtype=M)
+        inertia: wp.array(dtype=M)
+
+    return Bodies
+
+
+@cache
+def balance_kernel(real, linear, quadratic: bool, contact: bool):
+    """Build the kernel `balance`: residual and energy change of the blocks of bodies, one thread a body.
+
+    Carried nodes have no residual of their own; their energy changes stay with them.
+    """
+    V, Meeting, Bodies = wp.types.vector(3, real), meeting_type(real, linear), bodies_type(real)
+    Given, Found, H = inputs_type(real, quadratic), results_type(real, linear), wp.types.vector(3, linear)
+    (outer, settle), add = residual_functions(real, linear, quadratic, contact), elements_function(real, linear)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def balance(
+        inputs: Given,
+        bodies: Bodies,
+        sets: wp.array(dtype=Meeting),
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        outputs: Found,
+    ):
+        w, b = wp.tid()
+        if flags[STATUS, w] != 0:
+            return
+        accepted, c = flags[ENERGY_BUFFER, w], scalars[INERTIA_COEFFICIENT, w]
+        offset, carried = w * inputs.blocks, w * bodies.carried.shape[0]
+        k = bodies.origins[b]
+        center = k + offset
+        force, size, stiff, change = outer(inputs, center, k, w, c)
+        force, size, stiff, change, rounding = add(sets, k, w, accepted, force, size, stiff, change, wp.abs(change))
+        s = bodies.spins[b]
+        spin = s + offset
+        moment, moment_size, moment_stiff, work = outer(inputs, spin, s, w, c)
+        moment, moment_size, moment_stiff, work, moment_rounding = add(
+            sets, s, w, accepted, moment, moment_size, moment_stiff, work, wp.abs(work)
+        )
+        K = bodies.inertia[b + w * bodies.origins.shape[0]]
+        turn = inputs.q[spin]
+        u = turn - inputs.base[spin]
+        inertial = K * turn
+        work += wp.dot(u, inertial - K * u * real(0.5))
+        moment -= inertial
+        moment_stiff += wp.max(wp.get_diag(K))
+        for j in range(bodies.starts[b], bodies.starts[b + 1]):
+            k_j = bodies.carried[j]
+            i = k_j + offset
+            f, f_size, f_stiff, f_change = outer(inputs, i, k_j, w, c)
+            f, f_size, f_stiff, f_change, f_rounding = add(
+                sets, k_j, w, accepted, f, f_size, f_stiff, f_change, wp.abs(f_change)
+            )
+            y = bodies.y[j + carried]
+            arm = wp.length(y)
+            force += f
+            size += f_size
+            stiff += f_stiff
+            moment += wp.transpose(bodies.derivative[j + carried]) * f
+            moment_size += f_size * arm
+            moment_stiff += f_stiff * arm * arm
+            outputs.rhs[i] = H()
+            outputs.ratio[w, k_j] = real(0.0)
+            outputs.square[w, k_j] = real(0.0)
+            outputs.least[i] = real(0.0)
+            outputs.change[w, k_j] = f_change
+            outputs.rounding_error[w, k_j] = f_rounding
+        scale = scalars[LOAD_SCALE, w]
+        settle(inputs, outputs, flags, scale, center, k, w, force, size, stiff, change, rounding)
+        settle(inputs, outputs, flags, scale, spin, s, w, moment, moment_size, moment_stiff, work, moment_rounding)
+
+    return balance
+
+
+@cache
+def condense_kernel(real, linear, quadratic: bool, alone: bool):
+    """Build the kernel `condense`: add the entries of carried nodes to those of their bodies, and the inertia of rotations.
+
+    One thread takes one entry of the bodies' rows and columns, and adds L^T K R of the listed entries K of carried nodes, with L and R
+    the identity (`PLAIN`) or D of a carried node. `alone`: no element set has begun the matrix.
+    """
+    M, Bodies, Mass = wp.types.matrix((3, 3), linear), bodies_type(real), mass_type(real, quadratic)
+    inertia_of = inertia_function(real, linear, quadratic)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def condense(
+        mass: Mass,
+        bodies: Bodies,
+        targets: wp.array(dtype=int),
+        rows: wp.array(dtype=int),
+        turning: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        sources: wp.array(dtype=int),
+        left: wp.array(dtype=int),
+        right: wp.array(dtype=int),
+        positions: int,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        matrix: wp.array2d(dtype=linear),
+    ):
+        """`rows`: dof block of a diagonal entry, else -1; `turning`: the body if this is its rotation, else -1."""
+        w, t = wp.tid()
+        if flags[NEEDS_DIRECTION, w] == 0:
+            return
+        target, carried = targets[t] + w * positions, w * bodies.carried.shape[0]
+        m = M()
+        if wp.static(alone):
+            if rows[t] >= 0:
+                m = inertia_of(mass, scalars[INERTIA_COEFFICIENT, w], w, rows[t])
+        else:
+            for i in range(3):
+                for j in range(3):
+                    m[i, j] = matrix[3 * i + j, target]
+        for entry in range(starts[t], starts[t + 1]):
+            source = sources[entry] + w * positions
+            k = M()
+            for i in range(3):
+                for j in range(3):
+                    k[i, j] = matrix[3 * i + j, source]
+            if left[entry] != wp.static(PLAIN):
+                k = wp.transpose(M(bodies.derivative[left[entry] + carried])) * k
+            if right[entry] != wp.static(PLAIN):
+                k = k * M(bodies.derivative[right[entry] + carried])
+            m += k
+        if turning[t] >= 0:
+            m += M(bodies.inertia[turning[t] + w * bodies.origins.shape[0]])
+        for i in range(3):
+            for j in range(3):
+                matrix[3 * i + j, target] = m[i, j]
+
+    return condense
