@@ -12,13 +12,13 @@ ROD = "rod"
 
 @dataclass
 class Body:
-    """Collision body: a rod, shell or obstacle.
+    """Collision body: a rod, a shell, a shape of a rigid body, or an obstacle.
 
     Attributes:
         nodes, cells: nodes, and cells of nodes.
         kind, radius: kind of body and radius [m].
         name: name of the group; label: name in messages.
-        shell: index of the shell, -1 without.
+        shell, rigid: index of the shell or rigid body, -1 without.
         markers: carried nodes of a rotating surface; angles: twist angles of edges with rolling contact.
     """
 
@@ -31,6 +31,7 @@ class Body:
     closed: bool = False
     still: bool = False
     shell: int = -1
+    rigid: int = -1
     markers: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     angles: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 

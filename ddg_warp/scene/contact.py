@@ -251,6 +251,7 @@ def check_contact(scene) -> None:
                     f"contact: {name} is of friction, and there is none; give friction, or leave {name} out"
                 )
     bodies = {batch.name for batch in scene.batches} | {shell.name for shell in scene.shells}
+    bodies |= {body.name for body in scene.bodies if body.shapes}
     moving, obstacles = contact_names(scene), {obstacle.name for obstacle in scene.obstacles}
     names = moving | obstacles
     named = [("objects", name, bodies) for name in scene.contact_settings.objects or ()]
@@ -285,12 +286,12 @@ def _check_directed(scene, between: Between, obstacles: set[str]) -> None:
 
 
 def contact_names(scene) -> set[str]:
-    """Return the names of rods and shells with contact."""
+    """Return the names of rods, shells and rigid bodies with contact."""
     if scene.contact_settings is None:
         return set()
     if scene.contact_settings.objects is not None:
         return set(scene.contact_settings.objects)
-    return {batch.name for batch in scene.batches} | {shell.name for shell in scene.shells}
+    return {item.name for item in (*scene.batches, *scene.shells)} | {body.name for body in scene.bodies if body.shapes}
 
 
 def _names(label: str, values) -> tuple[str, ...]:

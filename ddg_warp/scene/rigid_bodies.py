@@ -103,7 +103,7 @@ class RigidBodies:
         center=None,
         velocity=(0.0, 0.0, 0.0),
         angular_velocity=(0.0, 0.0, 0.0),
-        name: str = "",
+        name: str = "body",
     ) -> Handle:
         """Add a rigid body of uniform density within shapes, or of given mass and inertia; return its handle.
 
@@ -115,9 +115,10 @@ class RigidBodies:
             center: centre of mass at rest (3,) [m], with `inertia`; by default of the shapes.
             velocity: initial velocity of the centre (3,) [m/s].
             angular_velocity: initial angular velocity (3,) [rad/s].
-            name: to ask for the body by.
+            name: to ask for the body by; bodies of one name have common contact parameters.
 
-        Attach rods and shells with `attach`. Shapes are for mass, inertia and display.
+        Attach rods and shells with `attach`. With `contact` the shapes collide with rods, shells, obstacles and other bodies, but not
+        with the rods and shells that the body carries, nor with bodies that a joint connects to it.
 
         Raises:
             SceneError: a shape without volume, an inertia that no body has, or a missing quantity; the message names it.
@@ -152,7 +153,7 @@ class RigidBodies:
         moments, axes = _principal(tensor)
         vectors = {"velocity": velocity, "angular_velocity": angular_velocity}
         rates = (np.array(argument_checks.vector(f"add_body: {key}", value)) for key, value in vectors.items())
-        name = name and argument_checks.text("add_body: name", name)
+        name = argument_checks.text("add_body: name", name)
         self.bodies.append(RigidBody(mass, np.array(middle), moments, axes, *rates, shapes, name))
         return Handle(len(self.bodies) - 1, BODY, name)
 

@@ -223,6 +223,7 @@ def limit_kernels(real, serial: bool):
     `near`: shorten long motions.
     `less`: correct the fraction of a motion that was shortened before CCD.
     `short`: mark worlds with a limited predictor.
+    `combine`: multiply fractions of a motion that was limited twice.
     """
     V = wp.types.vector(3, real)
     first_item, until = items_function(serial), until_function(serial)
@@ -334,7 +335,13 @@ def limit_kernels(real, serial: bool):
             if flags[CCD_LIMITED, w] != 0:
                 flags[SUPPORT_MOTION_PENDING, w] = wp.static(SUPPORTS_MOVING)
 
-    return modes, predicted, stay, near, less, short
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def combine(before: wp.array(dtype=real), time: wp.array(dtype=real)):
+        """Multiply fractions of a motion that was limited twice."""
+        w = wp.tid()
+        time[w] = time[w] * before[w]
+
+    return modes, predicted, stay, near, less, short, combine
 
 
 @cache

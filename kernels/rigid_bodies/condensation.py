@@ -12,10 +12,12 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.collision.contact.assembly import set_struct
+from ddg_warp.kernels.collision.contact.hessian_product import total_function
 from ddg_warp.kernels.core.inertia import mass_type
 from ddg_warp.kernels.core.islands import ENERGY_BUFFER, INERTIA_COEFFICIENT, LOAD_SCALE, NEEDS_DIRECTION, STATUS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.linear.sliced_ell import inertia_function
+from ddg_warp.kernels.linear.sliced_ell import inertia_function, product_functions
 from ddg_warp.kernels.residual.coupled_residual import (
     elements_function,
     inputs_type,
@@ -175,3 +177,75 @@ def condense_kernel(real, linear, quadratic: bool, alone: bool):
                 matrix[3 * i + j, target] = m[i, j]
 
     return condense
+
+
+@cache
+def contact_kernels(real, linear):
+    """Build the kernels of contact on carried nodes, one thread a body.
+
+    `gather`: add products of pairs at carried nodes to those of the bodies, and p . H p of their blocks.
+    `condense`: add the diagonal blocks of carried nodes to those of the bodies.
+    `condense_product`: add products at carried nodes to those of the bodies.
+    """
+    V, M, H = wp.types.vector(3, real), wp.types.matrix((3, 3), linear), wp.types.vector(3, linear)
+    Bodies, PairSet, total = bodies_type(real), set_struct(real, linear), total_function(real, linear)
+    _, free = product_functions(linear)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def gather(
+        bodies: Bodies,
+        sets: wp.array(dtype=PairSet),
+        in_pairs: wp.array(dtype=wp.uint8),
+        p: wp.array(dtype=H),
+        inactive_mask: wp.array(dtype=wp.uint8),
+        busy: wp.array(dtype=int),
+        out: wp.array(dtype=H),
+        dots_out: wp.array2d(dtype=linear),
+    ):
+        w, b = wp.tid()
+        if busy[w] != 1:
+            return
+        blocks, carried = dots_out.shape[1], w * bodies.carried.shape[0]
+        force, moment = H(), H()
+        for j in range(bodies.starts[b], bodies.starts[b + 1]):
+            node = bodies.carried[j] + w * blocks
+            if in_pairs[node] != wp.uint8(0):
+                y = total(sets, node)
+                force += y
+                moment += wp.transpose(M(bodies.derivative[j + carried])) * y
+        k, s = bodies.origins[b], bodies.spins[b]
+        i, j = k + w * blocks, s + w * blocks
+        y = out[i] + wp.cw_mul(force, free(inactive_mask[i]))
+        out[i] = y
+        dots_out[w, k] = wp.dot(p[i], y)
+        y = out[j] + wp.cw_mul(moment, free(inactive_mask[j]))
+        out[j] = y
+        dots_out[w, s] = wp.dot(p[j], y)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def condense(bodies: Bodies, blocks: int, diagonal: wp.array(dtype=M)):
+        w, b = wp.tid()
+        carried = w * bodies.carried.shape[0]
+        translation, rotation = M(), M()
+        for j in range(bodies.starts[b], bodies.starts[b + 1]):
+            K = diagonal[bodies.carried[j] + w * blocks]
+            D = M(bodies.derivative[j + carried])
+            translation += K
+            rotation += wp.transpose(D) * K * D
+        diagonal[bodies.origins[b] + w * blocks] = translation
+        diagonal[bodies.spins[b] + w * blocks] = rotation
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def condense_product(bodies: Bodies, blocks: int, product: wp.array(dtype=H)):
+        w, b = wp.tid()
+        carried = w * bodies.carried.shape[0]
+        force, moment = H(), H()
+        for j in range(bodies.starts[b], bodies.starts[b + 1]):
+            y = product[bodies.carried[j] + w * blocks]
+            force += y
+            moment += wp.transpose(M(bodies.derivative[j + carried])) * y
+        i, j = bodies.origins[b] + w * blocks, bodies.spins[b] + w * blocks
+        product[i] = product[i] + force
+        product[j] = product[j] + moment
+
+    return gather, condense, condense_product

@@ -161,6 +161,67 @@ def turn_kernel(real):
 
 
 @cache
+def depart_kernel(real):
+    """Build the kernel `depart`: let the motion of the predictor, which contact limits, begin at R_n and turn by `longest` at most.
+
+    Longer arcs are left to Newton's method, whose updates are limited one by one.
+    """
+    V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
+    _, vector, _ = rotation_functions(real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def depart(
+        rotation: wp.array(dtype=M),
+        predicted: wp.array(dtype=M),
+        spins: wp.array(dtype=int),
+        longest: wp.array(dtype=real),
+        blocks: int,
+        moved: wp.array(dtype=int),
+        base: wp.array(dtype=V),
+        q: wp.array(dtype=V),
+    ):
+        w, b = wp.tid()
+        if moved[w] == 0:
+            return
+        i, k = w * spins.shape[0] + b, spins[b] + w * blocks
+        start = vector(rotation[i] * wp.transpose(predicted[i]))
+        base[k] = start
+        angle = wp.length(start)
+        if angle > longest[b]:
+            q[k] = start * (real(1.0) - longest[b] / angle)
+
+    return depart
+
+
+@cache
+def shorten_kernel(real, linear):
+    """Build the kernel `shorten`: raise the squared rotations of worlds so that updates turn no body by more than `longest`.
+
+    The rotation of a body counts by `cap` over `longest`, where `cap` is the largest rotation of other updates [rad].
+    """
+    H = wp.types.vector(3, linear)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def shorten(
+        direction: wp.array(dtype=H),
+        spins: wp.array(dtype=int),
+        longest: wp.array(dtype=real),
+        cap: real,
+        blocks: int,
+        wanted: wp.array(dtype=int),
+        rotation: wp.array(dtype=real),
+    ):
+        w, b = wp.tid()
+        if wanted[w] == 0:
+            return
+        turn = direction[spins[b] + w * blocks]
+        scale = cap / longest[b]
+        wp.atomic_max(rotation, w, real(wp.dot(turn, turn)) * scale * scale)
+
+    return shorten
+
+
+@cache
 def place_kernel(real):
     """Build the kernel `place`: positions of carried nodes at an iterate, their arms y, and D; over (worlds, carried nodes)."""
     V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
@@ -208,12 +269,9 @@ def spread_kernel(real, linear):
         origins: wp.array(dtype=int),
         spins: wp.array(dtype=int),
         blocks: int,
-        wanted: wp.array(dtype=int),
         direction: wp.array(dtype=H),
     ):
         w, j = wp.tid()
-        if wanted[w] == 0:
-            return
         b = owner[j]
         first = w * blocks
         turn = derivative[j + w * carried.shape[0]] * V(direction[spins[b] + first])

@@ -18,6 +18,7 @@ from ddg_warp.errors import SceneError
 from ddg_warp.geometry import fundamental_forms
 from ddg_warp.geometry.surface import Surface
 from ddg_warp.scene import edge_forces
+from ddg_warp.scene.contact import contact_names
 from ddg_warp.scene.shells_and_joints import COINCIDE
 
 
@@ -84,6 +85,7 @@ class _Builder:
         self.markers: list[np.ndarray] = []
         self.bodies: list[np.ndarray] = []
         self.anchors: list[np.ndarray] = []
+        self.surfaces: list[list[np.ndarray]] = []
         self.numbers: list[tuple[np.ndarray, np.ndarray]] = []  # (nodes, angles) of some rods
         self.rod_edges = 0
         self.frames: list[np.ndarray] = []
@@ -131,8 +133,10 @@ class _Builder:
         self.markers.append(self._number(points[0] + radius * np.eye(3 if obstacle.spins else 0, 3)))
 
     def add_body(self, body) -> None:
-        """Number the centre of a rigid body."""
+        """Number the centre of a rigid body, and the points of its shapes if it is in contact."""
         self.bodies.append(self._number(body.center[None]))
+        shapes = body.shapes if body.name in contact_names(self.scene) else ()
+        self.surfaces.append([self._number(shape.points) for shape in shapes])
 
     def add_anchors(self, joint) -> None:
         """Number the points of a joint between rigid bodies, which either body carries."""
@@ -207,7 +211,8 @@ class _Builder:
             centers, anchors = (
                 merged[np.concatenate([np.zeros(0, int), *numbers])] for numbers in (self.bodies, self.anchors)
             )
-            places = centers, anchors.reshape(-1, 2), nodes + angles + joints
+            surfaces = [[merged[numbers] for numbers in each] for each in self.surfaces]
+            places = centers, anchors.reshape(-1, 2), surfaces, nodes + angles + joints
             coupled.rigid_bodies = rigid_bodies.carried_nodes(scene, coupled, *places)
         coupled.sets = element_sets.element_sets(scene, coupled, self.along)
         boundary_conditions.add_masses(scene, coupled)

@@ -50,6 +50,19 @@ def contact_parameters(scene, coupled: CoupledSystem) -> ContactParameters | Non
             membrane = float((plate.membrane_stiffness * np.sqrt(2.0 * plate.area)).max())
             elastic = max(BENDING * float(plate.bending_stiffness.max()) / half, STRAIN * membrane)
             forces.append((coupled.mass[shell.nodes, 0].max(), elastic))
+    for index, (body, shapes) in enumerate(
+        zip(scene.bodies, coupled.rigid_bodies.surfaces if scene.bodies else (), strict=True)
+    ):
+        for shape, nodes in zip(body.shapes, shapes, strict=False):
+            radius = law.radius.get(body.name, shape.radius)
+            if not radius > 0.0:
+                raise SceneError(
+                    f"contact: body {index} ('{body.name}') has a sharp shape; round it, as in Box(..., radius=...), or give "
+                    f"contact(radius={{{body.name!r}: ...}})"
+                )
+            geometry = nodes, shape.kind, radius, body.name, f"body {index} ('{body.name}')", nodes[shape.cells]
+            bodies.append(Body(*geometry, rigid=index))
+            forces.append((body.mass, 0.0))
     gravity, obstacles = float(np.linalg.norm(scene.gravity)), len(scene.obstacles)
     scale = [max(WEIGHTS * mass * gravity, elastic) for mass, elastic in forces]
     scale_mass = np.array([(force, mass) for force, (mass, _) in zip(scale, forces, strict=True)]).reshape(-1, 2).T
@@ -137,7 +150,8 @@ def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: n
 
 def _refuse_ranges(scene, within: np.ndarray, names) -> None:
     """Refuse activation distances (groups, groups) beyond the scene size or below the resolution of coordinates."""
-    points = np.concatenate([o.points.reshape(-1, 3) for o in (*scene.batches, *scene.shells)])
+    objects = *scene.batches, *scene.shells, *(shape for body in scene.bodies for shape in body.shapes)
+    points = np.concatenate([o.points.reshape(-1, 3) for o in objects])
     size, far = np.ptp(points, axis=0).max(), np.abs(points).max()
     for g, h in np.argwhere((within > BEYOND * size) | (within < RESOLVED * far))[:1]:
         wrong = (

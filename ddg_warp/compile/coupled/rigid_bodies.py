@@ -30,6 +30,7 @@ class RigidBodyArrays:
         moments: principal moments of inertia (B, 3) [kg m^2]; axes: principal axes at rest, columns (B, 3, 3).
         velocity, angular_velocity: initial velocity of the centre and angular velocity in space (B, 3).
         anchors: points of joints between bodies, as the first and as the second body carries them (J, 2).
+        surfaces: dof blocks of the points of each shape of each body in contact.
         world: fixed dof blocks of the joints with the world: points, then a rotation; empty without joints.
     """
 
@@ -46,6 +47,7 @@ class RigidBodyArrays:
     velocity: np.ndarray
     angular_velocity: np.ndarray
     anchors: np.ndarray
+    surfaces: list[list[np.ndarray]]
     world: np.ndarray
 
     def __len__(self) -> int:
@@ -61,8 +63,12 @@ class RigidBodyArrays:
         return result
 
 
-def carried_nodes(scene, coupled, centers: np.ndarray, anchors: np.ndarray, first_spin: int) -> RigidBodyArrays:
-    """Return the rigid bodies of a scene, with dof blocks of centres (B,) and anchors (J, 2), and rotations from `first_spin` on.
+def carried_nodes(
+    scene, coupled, centers: np.ndarray, anchors: np.ndarray, surfaces: list[list[np.ndarray]], first_spin: int
+) -> RigidBodyArrays:
+    """Return the rigid bodies of a scene, with dof blocks of centres (B,), anchors (J, 2) and the shapes of each body.
+
+    Rotations have blocks from `first_spin` on.
 
     Raises:
         SceneError: two bodies carry one node.
@@ -91,8 +97,10 @@ def carried_nodes(scene, coupled, centers: np.ndarray, anchors: np.ndarray, firs
                 world.append(block)
             else:
                 owners[block] = body
-    for body in np.flatnonzero(pinned):
-        owners[centers[body]] = body
+    for body, shapes in enumerate(surfaces):
+        owners |= dict.fromkeys(np.concatenate([np.zeros(0, int), *shapes]).tolist(), body)
+        if pinned[body]:
+            owners[centers[body]] = body
     world += [first_spin + len(scene.bodies)] * bool(scene.body_joints)
     carried, owner = np.array(list(owners), int), np.array(list(owners.values()), int)
     order = np.argsort(owner, kind="stable")
@@ -112,6 +120,7 @@ def carried_nodes(scene, coupled, centers: np.ndarray, anchors: np.ndarray, firs
         axes=np.array([body.axes for body in bodies]),
         **vectors,
         anchors=anchors,
+        surfaces=surfaces,
         world=np.array(world, int),
     )
     welded = [joint.second for joint in scene.body_joints if joint.call == "weld" and joint.first < 0]

@@ -6,7 +6,10 @@ from ddg_warp.compile.boundary_conditions import pose_starts
 
 
 def number_bodies(host) -> tuple[np.ndarray, int]:
-    """Return the body of every block (a rod or shell, joined ones together; -1 for none), and the largest number of bodies."""
+    """Return the body of every block, and the largest number of bodies.
+
+    A body is a rod, a shell or a rigid body; joined ones, carried rods and shells with their rigid bodies, have one number. -1 for none.
+    """
     ccd_body = np.full(host.blocks, -1, np.int32)
     count = 0
     for rod in host.rods:
@@ -15,7 +18,14 @@ def number_bodies(host) -> tuple[np.ndarray, int]:
     for shell in host.shells:
         ccd_body[shell.nodes], ccd_body[shell.edges[shell.edges >= 0]] = count, count
         count += 1
-    return _joined(ccd_body, host), count
+    parts = [rod.all_nodes for rod in host.rods] + [shell.nodes for shell in host.shells]
+    if (rigid := host.rigid_bodies) is not None:
+        for body in range(len(rigid)):
+            parts.append(np.append(rigid.carried[rigid.owner == body], [rigid.origins[body], rigid.spins[body]]))
+            ccd_body[parts[-1]] = count
+            count += 1
+        parts += [blocks[~np.isin(blocks, rigid.world)] for blocks in rigid.anchors]
+    return _joined(ccd_body, parts, host), count
 
 
 def number_units(body: np.ndarray, count: int, host, motions: list) -> tuple[np.ndarray, int]:
@@ -26,18 +36,16 @@ def number_units(body: np.ndarray, count: int, host, motions: list) -> tuple[np.
     return ccd_body, count + len(motions)
 
 
-def _joined(ccd_body: np.ndarray, host) -> np.ndarray:
-    """Return the body numbers with one number for bodies with common nodes, so that joints stay intact."""
+def _joined(ccd_body: np.ndarray, parts: list[np.ndarray], host) -> np.ndarray:
+    """Return the body numbers with one number for bodies with common nodes of `parts`, so that joints stay intact."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    pairs = [(ccd_body[rod.all_nodes], np.full(len(rod.all_nodes), i)) for i, rod in enumerate(host.rods)]
-    first = len(host.rods)
-    pairs += [(ccd_body[shell.nodes], np.full(len(shell.nodes), first + i)) for i, shell in enumerate(host.shells)]
+    pairs = [(ccd_body[nodes], np.full(len(nodes), part)) for part, nodes in enumerate(parts)]
     if not pairs:
         return ccd_body
     body, node = (np.concatenate(values) for values in zip(*pairs, strict=True))
-    size = int(ccd_body.max()) + 1
+    size = max(int(ccd_body.max()) + 1, len(parts))
     graph = coo_array((np.ones(len(body)), (body, node)), shape=(size, size))
     number = connected_components(graph, directed=False)[1]
     joined = np.where(ccd_body >= 0, number[ccd_body], -1).astype(np.int32)

@@ -198,8 +198,32 @@ def shapes_of(host) -> CollisionMesh:
             )
         if body.markers.size:
             shapes.spin(number, np.append(body.nodes[0], body.markers))
+    for first, second in _attached(host):
+        shapes.ignore(first, second)
     for g, h in contact_parameters.ignored:
         for first in np.flatnonzero(contact_parameters.group == g):
             for second in np.flatnonzero(contact_parameters.group == h):
                 shapes.ignore(int(first), int(second))
     return shapes
+
+
+def _attached(host) -> list[tuple[int, int]]:
+    """Return the pairs of collision bodies of one rigid body, of bodies that a joint connects, and of bodies with what they carry."""
+    rigid = host.rigid_bodies
+    if rigid is None:
+        return []
+    owner = np.full(host.blocks, -1)
+    owner[rigid.carried] = rigid.owner
+    linked = {(body, body) for body in range(len(rigid))}
+    for blocks in rigid.anchors:
+        first, second = owner[blocks].tolist()
+        linked |= {(first, second), (second, first)}
+    # rigid bodies of every collision body: its own, or those that carry its nodes
+    holders = [set(owner[body.nodes].tolist()) - {-1} for body in host.contact_parameters.bodies]
+    solid = [body.rigid for body in host.contact_parameters.bodies]
+    return [
+        (i, j)
+        for i, first in enumerate(solid)
+        for j, others in enumerate(holders)
+        if first >= 0 and any((first, other) in linked for other in others)
+    ]

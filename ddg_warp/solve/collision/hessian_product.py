@@ -15,6 +15,7 @@ class PairProduct:
 
     Attributes:
         sets: the sets, see `kernels.collision.contact.assembly.set_struct`; most: largest capacity of a set.
+        in_pairs: marks of the nodes in pairs, after `meet` (W N,).
     """
 
     def __init__(self, pair_sets: list, law, real, linear):
@@ -35,11 +36,11 @@ class PairProduct:
         self._sets = [self._set(pair_set) for pair_set in self._parts]  # an array of structures keeps no member alive
         self.sets = wp.array(self._sets, dtype=set_struct(self._real, self._linear), device=self._device)
         self.most = max(pair_set.found.capacity for pair_set in self._parts)
-        self._met = wp.zeros(len(self._parts[0].numbers), dtype=wp.uint8, device=self._device)
+        self.in_pairs = wp.zeros(len(self._parts[0].numbers), dtype=wp.uint8, device=self._device)
 
     def meet(self) -> None:
         """Mark the nodes in pairs, for `settle`."""
-        self._sweep(self._meet, len(self._met), [self.sets], [self._met])
+        self._sweep(self._meet, len(self.in_pairs), [self.sets], [self.in_pairs])
 
     def prepare(self, x: wp.array, wanted: wp.array) -> None:
         """Differentiate near-parallel edges at positions x, in `wanted` worlds."""
@@ -57,7 +58,7 @@ class PairProduct:
 
     def settle(self, v, out, inactive_mask: wp.array, busy: wp.array, dots: wp.array) -> None:
         """Add the products to active dofs in `busy` worlds, and write v . out of the nodes in pairs."""
-        self._sweep(self._settle, len(out), [self.sets, self._met, v, inactive_mask, busy], [out, dots])
+        self._sweep(self._settle, len(out), [self.sets, self.in_pairs, v, inactive_mask, busy], [out, dots])
 
     def place(self, v, x=None, wanted=None) -> None:
         """Write the contributions of pairs to a product; arguments as of `__call__`."""

@@ -20,6 +20,11 @@ class ContactHessian:
         self._terms, self._shapes, self.diagonal = terms, shapes, terms.blocks.diagonal
         self._bands = self._q = self._curved = None
 
+    @property
+    def products(self):
+        """`PairProduct` of contact and friction."""
+        return self._terms.products
+
     def bind(self, substructuring) -> None:
         """Add contact to the bands of a bound `RodSubstructuring` from now on."""
         self._bands = ContactBands(substructuring, self._shapes)

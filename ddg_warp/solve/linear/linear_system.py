@@ -7,9 +7,12 @@ import numpy as np
 import warp as wp
 
 
+CARRIED = 8  # bit of nodes that a rigid body carries: without dofs of their own, but active with the body
+
+
 @dataclass
 class DofMasks:
-    """Bits of dofs that a solve leaves unchanged, 1, 2 and 4 of the components of a dof block.
+    """Bits of dofs that a solve leaves unchanged, 1, 2 and 4 of the components of a dof block, and `CARRIED`.
 
     Attributes:
         fixed: (N,) fixed dofs, common to all worlds.
@@ -29,6 +32,8 @@ class DofMasks:
     def of(cls, coupled, idle_paths: wp.array | None) -> "DofMasks":
         """Return the masks of a `CoupledModel` without sleeping islands."""
         bits = mask(coupled.host.fixed)
+        if coupled.host.rigid_bodies:
+            bits[coupled.host.rigid_bodies.carried] |= CARRIED
         unskewed = bits.copy()
         unskewed[list(coupled.host.frames)] = 0
         kept = unskewed | mask(coupled.moves.numpy() <= 0.0)

@@ -44,6 +44,7 @@ class PCG:
             `natural_scale`.
         indefinite: True if H may be indefinite.
         user_forces: `UserForces` to add to H, or None.
+        rigid_bodies: `RigidBodies`, whose carried nodes contact moves, or None.
 
     Attributes:
         `rest`, `z`: scaled residual, preconditioned residual.
@@ -64,7 +65,9 @@ class PCG:
         indefinite: bool = False,
         scale: float = 1.0,
         user_forces=None,
+        rigid_bodies=None,
     ):
+        self._rigid_bodies = rigid_bodies
         self._scale, self._unit = linear(scale), linear(1.0 / scale)
         self.coupled, self.sparsity, self.substructuring, self.contact = coupled, sparsity, substructuring, contact
         self._pair_forces = user_forces if user_forces and user_forces.pairs else None
@@ -171,8 +174,12 @@ class PCG:
         else:
             elements = partial(self.multiply_matrix, system, p)
         if self.contact:
+            if self._rigid_bodies:
+                self._rigid_bodies.spread(p)
             device_arrays.side_by_side([elements, partial(self.contact.spread, p)], self.coupled.device)
             self.contact.settle(p, self.product, system)
+            if self._rigid_bodies:
+                self._rigid_bodies.gather(self.contact.products, p, self.product, system)
         else:
             elements()
         if self._pair_forces:
@@ -212,10 +219,11 @@ class NewtonPCG(PCG):
         relaxed,
         keeps_levels: bool,
         user_forces=None,
+        rigid_bodies=None,
     ):
         self.scale, real = natural_scale(coupled), coupled.real
         parts = coupled, sparsity, substructuring, contact, linear, multilevel
-        super().__init__(*parts, scale=self.scale, user_forces=user_forces)
+        super().__init__(*parts, scale=self.scale, user_forces=user_forces, rigid_bodies=rigid_bodies)
         self._tolerances, self._rtol, self._relaxed = tolerances, rtol, relaxed
         self._keeps_levels = keeps_levels
         self._largest = Sums(coupled.worlds, tolerances.ratio.shape[1], real, coupled.device, largest=True)

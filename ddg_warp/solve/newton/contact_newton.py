@@ -5,6 +5,8 @@ predictor or support motion was limited has motion pending. Its target `Iterates
 but contact are evaluated there, and contact is linear about the positions. The next direction begins with the remaining motion.
 """
 
+from functools import partial
+
 import numpy as np
 import warp as wp
 
@@ -111,11 +113,15 @@ class NewtonContact:
             self._launch(self._brace, [*islands.arrays, dt], [self._braced, self.terms.law.rate])
 
     @timer("CCD filter")
-    def place(self, iterates, system, islands) -> None:
-        """Limit the predictor by CCD, once supports are at their prescribed positions."""
+    def place(self, iterates, system, islands, rigid_bodies=None) -> None:
+        """Limit the predictor by CCD, once supports are at their prescribed positions.
+
+        Args:
+            rigid_bodies: `RigidBodies` or None.
+        """
         self.pending.aim(iterates)
         self.limit.begin(islands, self.pending, predictor=True)
-        self._limit(iterates, system, islands)
+        self._limit(iterates, system, islands, rigid_bodies)
         self.limit.mark_limited(islands)
         self.pending.end(iterates, islands)
 
@@ -141,21 +147,21 @@ class NewtonContact:
         self.hessian.assemble()
 
     @timer("CCD filter")
-    def hold(self, iterates, search, system, islands) -> None:
-        """Limit the trial step by CCD, and write its predicted decrease."""
+    def hold(self, iterates, search, system, islands, rigid_bodies=None) -> None:
+        """Limit the trial step by CCD, and write its predicted decrease; `rigid_bodies`: see `place`."""
         modes, blocks = self.limit.modes, self.coupled.blocks
         self.limit.begin(islands, self.pending)
         self.pending.land(iterates, system, islands, modes)
-        self._limit(iterates, system, islands)
+        self._limit(iterates, system, islands, rigid_bodies)
         self.pending.end(iterates, islands)
         self.coupled.sweep(self._differ_gain, [system.rhs, iterates.q, iterates.base, modes, blocks], [self._dots])
         self._sum(self._dots, self._gain)
         inputs = [modes, self.search.time, self._gain]
         self._launch(self._expect, inputs, [*islands.arrays, search.stalled, self._projected])
 
-    def _limit(self, iterates, system, islands) -> None:
+    def _limit(self, iterates, system, islands, rigid_bodies) -> None:
         """Limit the proposed motion by CCD, that of supports included."""
-        self.limit(iterates)
+        self.limit(iterates, rigid_bodies and partial(rigid_bodies.place, iterates, islands))
         self.pending.arrive(iterates, system, islands, self.limit.modes)
 
     @timer("interpenetration check")

@@ -177,7 +177,8 @@ class CoupledNewton:
             multilevel = preconditioner in ("multilevel", "substructuring_multilevel")
             keeps_levels = self.keeps_levels and not (self.contact or self.user_forces)
             stop = self.tolerances, options.rtol, self.relaxed, keeps_levels
-            self.krylov = NewtonPCG(coupled, *parts, self.linear, multilevel, *stop, self.user_forces)
+            outer = self.user_forces, self.rigid_bodies
+            self.krylov = NewtonPCG(coupled, *parts, self.linear, multilevel, *stop, *outer)
 
     def _require_exact(self) -> None:
         """Refuse the exact Hessian for measures without second derivatives."""
@@ -283,7 +284,7 @@ class CoupledNewton:
         if self.edge_rotations:
             wp.capture_if(self.islands.any_edge_rotation, lambda: self._rotate(state))
         if self.contact:
-            self.contact.hold(self.iterates, self.search_state, self.system, self.islands)
+            self.contact.hold(self.iterates, self.search_state, self.system, self.islands, self.rigid_bodies)
 
     def _find_direction(self) -> None:
         """Compute search directions and step lengths of worlds that do not backtrack."""
@@ -340,6 +341,8 @@ class CoupledNewton:
             return
         contact = partial(self.contact.assemble, self.iterates, self.islands)
         device_arrays.side_by_side([self._assemble_elements, contact], self.coupled.device)
+        if self.rigid_bodies:
+            self.rigid_bodies.condense_contact(self.contact.hessian.diagonal)
         self.contact.hessian.add_to_bands(self.islands.arrays[0])
 
     def _assemble_elements(self) -> None:
@@ -362,7 +365,7 @@ class CoupledNewton:
             self.substructuring.direct(system, self.inertia, islands, self.updated_islands)
         else:
             if self.contact:
-                self.contact.pending.approach(self.iterates, system, self.contact.terms)
+                self.contact.pending.approach(self.iterates, system, self.contact.terms, self.rigid_bodies)
             self.krylov.solve(system, islands, self.after_cycle)
             if self.contact:
                 self.contact.pending.follow(system)
@@ -383,10 +386,13 @@ class CoupledNewton:
     def measure_rotation(self) -> None:
         """Compute the largest squared rotation of the directions, transformed to spatial components."""
         if self.rigid_bodies:
-            self.rigid_bodies.spread(self.system)
+            self.rigid_bodies.spread(self.system.direction)
         if self.planes:
             self.planes.back(self.system.direction, self.system.wanted)
         self.line_search.measure_rotation(self.iterates, self.search_state, self.system)
+        if self.rigid_bodies:
+            cap, search = self.options.rotation_cap, self.search_state
+            self.rigid_bodies.shorten(self.system.direction, cap, self.system.wanted, search.rotation)
 
     @timer("edge rotation")
     def _rotate(self, state) -> None:

@@ -57,15 +57,23 @@ class PendingMotion:
         inputs = [iterates.q, islands.arrays[0], self.coupled.blocks]
         self.coupled.sweep(self._end, inputs, [iterates.proposed, self.going])
 
-    def approach(self, iterates, system, terms) -> None:
-        """Subtract the resistance of a `ContactPotential` against pending motion from the residual."""
+    def approach(self, iterates, system, terms, rigid_bodies) -> None:
+        """Subtract the resistance of a `ContactPotential` against pending motion from the residual.
+
+        Args:
+            rigid_bodies: `RigidBodies` or None.
+        """
         blocks, fixed, wanted = self.coupled.blocks, system.masks.fixed, system.wanted
 
         def approach() -> None:
             self.coupled.sweep(self._find_rest, [iterates.q, iterates.proposed, wanted, blocks], [self._rest])
             self._launch(self._push, [self._aims, iterates.q, fixed, wanted, blocks], [self._rest])
             self._product.zero_()
+            if rigid_bodies:
+                rigid_bodies.spread(self._rest)
             terms.product(self._rest, self._product)
+            if rigid_bodies:
+                rigid_bodies.condense_product(self._product)
             self.coupled.sweep(self._lessen, [self._product, fixed, wanted, blocks], [system.rhs])
 
         wp.capture_if(self.going, approach)

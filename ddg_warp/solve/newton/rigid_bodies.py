@@ -1,8 +1,10 @@
 """Rigid bodies in the solves of the coupled system; see `kernels.rigid_bodies`."""
 
+import numpy as np
 import warp as wp
 
 from ddg_warp.kernels.rigid_bodies import condensation, motion
+from ddg_warp.solve.collision.support_arcs import PART
 from ddg_warp.timers import timer
 
 
@@ -16,11 +18,13 @@ class RigidBodies:
 
     Attributes:
         predicted: orientations after the torque-free flight (W B,).
+        longest: largest rotation of each body in one motion that contact limits (B,) [rad].
         bodies: struct of kernels, with y and D of carried nodes and the inertia of rotations.
     """
 
     def __init__(self, tables, sparsity, linear, quadratic: bool, inertia_structs: bool, outer: bool):
         self.tables, self.sparsity, self.coupled = tables, sparsity, tables.coupled
+        self._touches = tables.coupled.host.contact_parameters is not None
         coupled, real, device = tables.coupled, tables.coupled.real, tables.coupled.device
         worlds, bodies, carried = coupled.worlds, len(tables), len(tables.host.carried)
         self.predicted = wp.zeros(worlds * bodies, dtype=tables.matrix, device=device)
@@ -30,14 +34,19 @@ class RigidBodies:
         struct.y = wp.zeros(worlds * carried, dtype=coupled.vector, device=device)
         struct.derivative = wp.zeros(worlds * carried, dtype=tables.matrix, device=device)
         struct.inertia = wp.zeros_like(self.predicted)
+        longest = _longest_arcs(coupled.host) if self._touches else np.full(bodies, np.inf)
+        self.longest = wp.array(longest, dtype=real, device=device)
+        self._shorten = motion.shorten_kernel(real, linear)
         self._place, self._spread = motion.place_kernel(real), motion.spread_kernel(real, linear)
         self._balance = condensation.balance_kernel(real, linear, quadratic, outer)
+        self._gather, self._condense_diagonal, self._condense_product = condensation.contact_kernels(real, linear)
         self._condense = condensation.condense_kernel(real, linear, inertia_structs, not coupled.sets)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [self._place, self._spread, self._balance, self._condense]
+        contact = [self._gather, self._condense_diagonal, self._condense_product, self._shorten]
+        return [self._place, self._spread, self._balance, self._condense, *(contact if self._touches else [])]
 
     def place(self, iterates, islands) -> None:
         """Place carried nodes at the iterate."""
@@ -46,11 +55,34 @@ class RigidBodies:
         inputs += [self.coupled.blocks, islands.status]
         self._launch(self._place, self._carried, inputs, [iterates.q, struct.y, struct.derivative])
 
-    def spread(self, system) -> None:
-        """Write the displacements of carried nodes along directions."""
+    def spread(self, direction: wp.array) -> None:
+        """Write the displacements of carried nodes along directions of the linear solver."""
         tables = self.tables
         inputs = [self.bodies.derivative, tables.owner, tables.carried, tables.origins, tables.spins]
-        self._launch(self._spread, self._carried, [*inputs, self.coupled.blocks, system.wanted], [system.direction])
+        self._launch(self._spread, self._carried, [*inputs, self.coupled.blocks], [direction])
+
+    def shorten(self, direction: wp.array, cap: float, wanted: wp.array, rotation: wp.array) -> None:
+        """Raise the squared rotations of worlds (worlds,) so that updates in contact turn no body by more than its `longest`.
+
+        Args:
+            cap: largest rotation of updates [rad].
+        """
+        if self._touches:
+            inputs = [direction, self.tables.spins, self.longest, cap, self.coupled.blocks, wanted]
+            self._launch(self._shorten, len(self.tables), inputs, [rotation])
+
+    def gather(self, products, p: wp.array, product: wp.array, system) -> None:
+        """Add the products of contact pairs at carried nodes, see `PairProduct.settle`, to those of the bodies."""
+        inputs = [self.bodies, products.sets, products.in_pairs, p, system.masks.inactive, system.wanted]
+        self._launch(self._gather, len(self.tables), inputs, [product, system.dots])
+
+    def condense_contact(self, diagonal: wp.array) -> None:
+        """Add the diagonal blocks of contact at carried nodes to those of the bodies."""
+        self._launch(self._condense_diagonal, len(self.tables), [self.bodies, self.coupled.blocks], [diagonal])
+
+    def condense_product(self, product: wp.array) -> None:
+        """Add a product at carried nodes to that of the bodies."""
+        self._launch(self._condense_product, len(self.tables), [self.bodies, self.coupled.blocks], [product])
 
     @timer("residual")
     def balance(self, inputs, sets: wp.array, islands, outputs) -> None:
@@ -74,3 +106,22 @@ class RigidBodies:
 
     def _launch(self, kernel, count: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, (self.coupled.worlds, count), inputs, outputs, device=self.coupled.device)
+
+
+def _longest_arcs(host) -> np.ndarray:
+    """Return the largest rotation of every body in one motion (B,) [rad], infinite without a surface.
+
+    CCD moves points straight. The sagitta R a^2 / 8 of an arc stays below `PART` of the activation distance and of the thickness; see
+    `ddg_warp.solve.collision.support_arcs`.
+    """
+    rigid, contact = host.rigid_bodies, host.contact_parameters
+    result = np.full(len(rigid), np.inf)
+    least = min(body.radius for body in contact.bodies)
+    for number, body in enumerate(contact.bodies):
+        if body.rigid >= 0:
+            arms = rigid.arms[np.isin(rigid.carried, body.nodes)]
+            longest = np.linalg.norm(arms, axis=1).max() + body.radius
+            group = contact.group[number]
+            allowed = PART * min(contact.range[group].min(), body.radius + least)
+            result[body.rigid] = min(result[body.rigid], np.sqrt(8.0 * allowed / longest))
+    return result

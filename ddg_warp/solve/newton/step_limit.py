@@ -1,6 +1,7 @@
 """CCD step fractions of the coupled system: limits of every proposed motion, a predictor or an update."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import warp as wp
@@ -12,6 +13,7 @@ from ddg_warp.solve.collision.ccd_bodies import number_units
 FAR = 16.0  # margins that a node moves, from which on a world has a single step fraction: candidates of longer motions are too many
 # Where candidates still do not fit, motions are limited to LONGEST margins, then to a fraction SHORTER until they do.
 LONGEST, SHORTER = 4096.0, 0.25
+ARC_ROUNDS = 2  # most searches along straight motions to the arcs of limited rigid bodies
 
 
 class StepLimit:
@@ -35,16 +37,23 @@ class StepLimit:
         self._start = wp.zeros(self.coupled.worlds * self.coupled.blocks, dtype=self.coupled.vector, device=device)
         self.modes = wp.zeros(self.coupled.worlds, dtype=int, device=device)
         self._longest, self.farthest = wp.zeros(self.coupled.worlds, dtype=real, device=device), math.inf
+        self._fractions = wp.zeros_like(self._longest)
         self.kernels = limit_kernels(real, device_arrays.serial(device))
-        self._find_modes, self._find_predicted, self._stay, self._near, self._less, self._find_short = self.kernels
+        self._find_modes, self._find_predicted, self._stay, self._near, self._less = self.kernels[:5]
+        self._find_short, self._combine = self.kernels[5:]
 
     def begin(self, islands, pending, predictor: bool = False) -> None:
         """Find the worlds with a proposed motion: of an update, or the predictor of a step; reset `PendingMotion.going`."""
         kernel = self._find_predicted if predictor else self._find_modes
         self._launch(kernel, [islands.arrays[0]], [self.modes, self._longest, pending.going])
 
-    def __call__(self, iterates) -> None:
-        """Limit the proposed motion from `base` to `q`; `proposed` keeps the proposed end."""
+    def __call__(self, iterates, place: Callable[[], None] | None = None) -> None:
+        """Limit the proposed motion from `base` to `q`; `proposed` keeps the proposed end.
+
+        Args:
+            place: places the nodes that rigid bodies carry at q. A limited body ends on its arc, beside the straight motions that have
+                been searched. Its straight motions to there are then limited in turn, up to `ARC_ROUNDS` times.
+        """
         q, blocks, far = iterates.q, self.coupled.blocks, FAR * self.search.margin
         inputs = [q, iterates.base, self._ccd_body, self.coupled.host.nodes, far, blocks]
         self.coupled.sweep(self._stay, inputs, [self._start, self.modes, iterates.proposed, self._longest])
@@ -56,6 +65,19 @@ class StepLimit:
         )
         if self.farthest < math.inf:
             self._launch(self._less, shorter, [self.search.time])
+        if place:
+            self._follow_arcs(q, place)
+
+    def _follow_arcs(self, q: wp.array, place: Callable[[], None]) -> None:
+        """Place the limited bodies on their arcs, and limit the straight motions to there."""
+        for _ in range(ARC_ROUNDS):
+            place()
+            wp.copy(self._fractions, self.search.time)
+            self.search.filter(
+                self._start, q, self._ccd_body, self.modes, self._num_ccd_bodies, self.min_separation_fraction
+            )
+            self._launch(self._combine, [self._fractions], [self.search.time])
+        place()
 
     def mark_limited(self, islands) -> None:
         """Mark worlds with a limited predictor: their motion is pending."""

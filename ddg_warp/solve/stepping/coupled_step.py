@@ -268,6 +268,8 @@ class CoupledStep(StepDriver):
         start = self._start_frames(before)
         if self.motion:
             self.motion.direct(islands, iterates.q, start.frame)
+        if self.bodies and self.contact:
+            self.bodies.depart(before)
         return start
 
     def warm_start(self, before) -> None:

@@ -21,12 +21,13 @@ class RigidBodyStep:
         self.newton, self.bodies, self.tables = newton, newton.rigid_bodies, newton.rigid_bodies.tables
         self.coupled, real = newton.coupled, newton.coupled.real
         self._predict, self._turn = motion.predict_kernel(real, midpoint), motion.turn_kernel(real)
-        self._finish = motion.finish_kernel(real, midpoint)
+        self._finish, self._depart = motion.finish_kernel(real, midpoint), motion.depart_kernel(real)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [self._predict, self._turn, self._finish, *self.tables.kernels]
+        departs = [self._depart] if self.newton.contact else []
+        return [self._predict, self._turn, self._finish, *departs, *self.tables.kernels]
 
     def predict(self, before) -> None:
         """Find the orientations after the flight, and place carried nodes there."""
@@ -45,6 +46,12 @@ class RigidBodyStep:
         q = self.newton.iterates.q
         self.turn(before)
         self.coupled.turn_ghosts(before, start, q, self.newton.islands.substep_accepted)
+
+    def depart(self, before) -> None:
+        """Let the motion of the predictor begin at the orientations of a state `before`, in contact."""
+        iterates, islands = self.newton.iterates, self.newton.islands
+        inputs = [before.rotation, self.bodies.predicted, self.tables.spins, self.bodies.longest, self.coupled.blocks]
+        self._launch(self._depart, [*inputs, islands.substep_accepted], [iterates.base, iterates.q])
 
     def finish(self, before, after) -> None:
         """Write poses and momenta at the end of accepted substeps, with carried nodes."""

@@ -195,7 +195,9 @@ class StepDriver:
             with timer("warm start"):  # the last correction, extrapolated
                 self.warm_start(before)
         if contact:
-            contact.place(newton.iterates, newton.system, self.islands)  # CCD filter of the predictor
+            contact.place(
+                newton.iterates, newton.system, self.islands, newton.rigid_bodies
+            )  # CCD filter of the predictor
             contact.lag(before.q, rate=before.rate)
         self.solve(start)  # Newton's method
         for solution in contact.solutions if contact else ():  # further friction iterations

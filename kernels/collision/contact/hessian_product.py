@@ -19,6 +19,27 @@ from ddg_warp.kernels.linear.sliced_ell import ALL_INACTIVE, product_functions
 
 
 @cache
+def total_function(real, linear):
+    """Return the device function `total(sets, node)`: the sum of the products of pairs at a node."""
+    PairSet, V = set_struct(real, linear), wp.types.vector(3, linear)
+    _, placed_at = place_functions(linear)
+
+    @wp.func
+    def total(sets: wp.array(dtype=PairSet), node: int):
+        y = V()
+        for s in range(sets.shape[0]):
+            number = sets[s].numbers[node]
+            if number > 0:  # few nodes are in pairs of a kind: other fields are not read
+                pair_set = sets[s]
+                start = pair_set.places[node]
+                for k in range(start, start + number):
+                    y += placed_at(pair_set.placed, k)
+        return y
+
+    return total
+
+
+@cache
 def product_kernels(real, linear, serial: bool, rolls: bool):
     """Build the kernels of the product.
 
@@ -32,7 +53,7 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
     A = wp.types.vector(ANGLES, linear)
     bend = bend_function(linear)
     row_of, direction_of, weight_of = row_functions(linear)
-    store, placed_at = place_functions(linear)
+    (store, _), total = place_functions(linear), total_function(real, linear)
     prefetch, four_of = prefetch_function(real, linear), read_function(wp.vec4i)
     _, free = product_functions(linear)
 
@@ -145,18 +166,6 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
                         store(pair_set.placed, ranks[local], V())
                     if wp.static(rolls):
                         store_angles(pair_set, p, A())
-
-    @wp.func
-    def total(sets: wp.array(dtype=PairSet), node: int):
-        y = V()
-        for s in range(sets.shape[0]):
-            number = sets[s].numbers[node]
-            if number > 0:  # few nodes are in pairs of a kind: other fields are not read
-                pair_set = sets[s]
-                start = pair_set.places[node]
-                for k in range(start, start + number):
-                    y += placed_at(pair_set.placed, k)
-        return y
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def gather(sets: wp.array(dtype=PairSet), out: wp.array(dtype=V)):
