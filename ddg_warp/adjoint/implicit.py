@@ -21,6 +21,7 @@ from ddg_warp.capture_lock import launches, stays_here
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.model.controls import Controls, checked
 from ddg_warp.model.coupled_model import CoupledState
+from ddg_warp.model.rigid_bodies import refuse_rigid_bodies
 from ddg_warp.model.state import State, check_state
 
 
@@ -54,6 +55,7 @@ class Adjoint:
     """
 
     def __init__(self, integrator):
+        refuse_rigid_bodies("gradients", integrator.model)
         self.integrator, self.model = integrator, integrator.model
         refuse_gyroscopic("Adjoint", integrator.gyroscopic)
         integrator.step_whole()

@@ -1,7 +1,7 @@
 """Residual tolerance: bound the error of internal forces relative to the load of the body.
 
-Every rod, shell, meridian and rigid body is a *body* with the load scale W, the sum of its external forces alone. Clusters are single nodes, eight
-nodes, eight such clusters, and so on: along a rod, or along a space-filling curve of a shell.
+Every rod, shell, meridian and rigid body is a *body* with the load scale W, the sum of its external forces alone. Clusters are single
+nodes, eight nodes, eight such clusters, and so on: along a rod, or along a space-filling curve of a shell.
 
 - Rods and meridians: |sum of r| <= rtol W over every cluster bounds the error of the axial force by rtol W.
 - Shells: internal forces are per length. Over a cluster with the fraction a of the area, |sum of r| <= rtol W sqrt(a). Large clusters

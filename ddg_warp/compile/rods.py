@@ -64,7 +64,10 @@ class RodArrays:
 
 
 def coupled_rods(scene: Scene) -> np.ndarray:
-    """Return the mask of coupled rods (R,) bool: joined, attached, carried by a body, magnetised, in contact, or with a user-defined force."""
+    """Return the mask of coupled rods (R,) bool.
+
+    They are joined, attached, carried by a body, magnetised, in contact, or have a user-defined force.
+    """
     members = [rod for joint in scene.joints for rod, _ in joint.members]
     members += [attachment.rod for attachment in scene.attachments]
     members += [attachment.index for attachment in scene.body_attachments if attachment.kind == "rod"]

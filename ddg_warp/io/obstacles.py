@@ -24,7 +24,7 @@ SHARP = np.cos(np.radians(35.0))  # cosine between a triangle and the vertex nor
 
 @dataclass(frozen=True)
 class Obstacles:
-    """Obstacles of a model as surfaces that follow their nodes; see `model.obstacles`.
+    """Obstacles and rigid bodies of a model as surfaces that follow their nodes; see `model.obstacles`.
 
     A plane has three nodes, its point and two more 1 m away along in-plane directions, and is shown as a rectangle. A ball has its
     center, a capsule both ends of its axis, a mesh its vertices, shown without thickness.
@@ -51,22 +51,22 @@ class Obstacles:
     triangles: Integers
 
     @classmethod
-    def of(cls, obstacles, points: np.ndarray) -> Obstacles:
-        """Return the obstacles of a scene, with planes displayed around all other objects.
+    def of(cls, obstacles: list[tuple], points: np.ndarray) -> Obstacles:
+        """Return obstacles as surfaces, with planes displayed around all other objects.
 
         Args:
-            obstacles: `scene.obstacles`.
+            obstacles: (shape, name, whether it moves) each.
             points: Positions of rods and shells [m], shape (P, 3).
         """
-        shapes = [each.shape for each in obstacles]
+        shapes, names, moved = zip(*obstacles, strict=True)
         surroundings = np.concatenate([points, *(_box(shape) for shape in shapes if shape.kind != PLANE)])
         solid = [shape.cells if shape.kind == MESH else np.zeros((0, 3), int) for shape in shapes]
         return cls(
-            names=np.array([each.name for each in obstacles], object),
+            names=np.array(names, object),
             kinds=np.array([shape.kind for shape in shapes], object),
             radius=np.array([shape.radius for shape in shapes], float),
             counts=np.array([len(shape.points) for shape in shapes]),
-            moved=np.array([each.motion is not None for each in obstacles]),
+            moved=np.array(moved),
             rest=np.concatenate([shape.points for shape in shapes]),
             spans=np.array(
                 [_span(shape.points, surroundings) if shape.kind == PLANE else np.zeros(4) for shape in shapes]

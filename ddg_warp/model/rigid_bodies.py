@@ -1,8 +1,11 @@
 """Rigid bodies of the coupled system on a device: constant arrays, and their initial state."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import warp as wp
 
+from ddg_warp.errors import SceneError
 from ddg_warp.kernels.rigid_bodies import motion
 
 REST, TORQUE = "rest_6", "torque"  # driven parameters of the term "hinge": angle and torque
@@ -62,4 +65,68 @@ class RigidBodyTables:
             [*inputs, self.coupled.blocks],
             [state.q, state.v],
             device=self.coupled.device,
+        )
+
+
+@dataclass(frozen=True)
+class BodyState:
+    """Pose and rates of a rigid body; with several worlds, arrays begin with the worlds.
+
+    Attributes:
+        position: centre of mass (3,) [m].
+        rotation: from the orientation at rest to that of the state, a matrix (3, 3).
+        velocity: of the centre of mass (3,) [m/s].
+        angular_velocity: in space (3,) [rad/s].
+    """
+
+    position: np.ndarray
+    rotation: np.ndarray
+    velocity: np.ndarray
+    angular_velocity: np.ndarray
+
+
+def body_state(state, index: int) -> BodyState:
+    """Return pose and rates of a rigid body in a `State`."""
+    model, host = state.model, state.model.coupled.host.rigid_bodies
+    of_worlds = (array.numpy().astype(float) for array in (state.coupled.rotation, state.coupled.momentum))
+    rotation, momentum = (v.reshape(model.worlds, len(host), *v.shape[1:])[:, index] for v in of_worlds)
+    blocks = (array.numpy().astype(float).reshape(model.worlds, -1, 3) for array in (state.coupled.q, state.coupled.v))
+    position, velocity = (values[:, host.centers[index]] for values in blocks)
+    rates = np.einsum("wji,wj->wi", rotation, momentum) / host.moments[index]
+    values = position, rotation @ host.axes[index].T, velocity, np.einsum("wij,wj->wi", rotation, rates)
+    return BodyState(*(value[0] if model.worlds == 1 else value for value in values))
+
+
+def shape_points(state) -> np.ndarray:
+    """Return the nodes of all shapes of rigid bodies in a `State` (worlds, M, 3) [m], in the order of bodies."""
+    model, host, values = state.model, state.model.coupled.host.rigid_bodies, []
+    for index, body in enumerate(model.scene.bodies):
+        if not body.shapes:
+            continue
+        pose = body_state(state, index)
+        position, rotation = pose.position.reshape(-1, 1, 3), pose.rotation.reshape(-1, 3, 3)
+        arms = np.concatenate([shape.points for shape in body.shapes]) - model.coupled.host.rest[host.centers[index]]
+        values.append(position + arms @ rotation.transpose(0, 2, 1))
+    return np.concatenate(values, axis=1)
+
+
+def body_energies(state) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rotational kinetic energy of rigid bodies, and the potential of gravity that masses of dofs lack (worlds,) [J].
+
+    The weight of a pinned body acts at its centre, while its mass counts at the pin.
+    """
+    model, host = state.model, state.model.coupled.host.rigid_bodies
+    of_worlds = (array.numpy().astype(float) for array in (state.coupled.rotation, state.coupled.momentum))
+    rotation, momentum = (v.reshape(model.worlds, len(host), *v.shape[1:]) for v in of_worlds)
+    kinetic = 0.5 * (np.einsum("wbji,wbj->wbi", rotation, momentum) ** 2 / host.moments).sum((1, 2))
+    q = state.coupled.q.numpy().astype(float).reshape(model.worlds, -1, 3)
+    weight = model.coupled.host.mass[host.origins] * np.array(model.scene.gravity, float)
+    return kinetic, -((q[:, host.centers] - q[:, host.origins]) * weight).sum((1, 2))
+
+
+def refuse_rigid_bodies(call: str, model) -> None:
+    """Raise SceneError if a model has rigid bodies, for a call that does not support these."""
+    if model.scene.bodies:
+        raise SceneError(
+            f"{call}: body 0 ('{model.scene.bodies[0].name}') is rigid; rigid bodies are stepped in time alone, by an Integrator"
         )

@@ -12,8 +12,9 @@ from ddg_warp import device_arrays as arrays
 from ddg_warp.capture_lock import launches
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import polyline
+from ddg_warp.model.rigid_bodies import BodyState, body_state, shape_points
 from ddg_warp.scene.descriptions import Dynamics
-from ddg_warp.scene.handle import OBSTACLE, Handle
+from ddg_warp.scene.handle import BODY, OBSTACLE, Handle, named
 from ddg_warp.typing import Array, Bools, Device, Floats, Names
 
 if TYPE_CHECKING:
@@ -228,13 +229,26 @@ class State:
         return values if item is None else order.nodes_of(item, values)
 
     def obstacle_points(self) -> Floats:
-        """Return positions of nodes of moving obstacles (M, 3) or (worlds, M, 3) [m], see `Model.obstacles`."""
+        """Return positions of nodes of moving obstacles, then of shapes of rigid bodies, (M, 3) or (worlds, M, 3) [m].
+
+        See `Model.obstacles`.
+        """
         model = self.model
-        if model.obstacles is None:
-            return np.zeros((0, 3) if model.worlds == 1 else (model.worlds, 0, 3))
-        nodes = np.concatenate(model.coupled.host.obstacles)[model.obstacles.moving]
-        values = self.coupled.q.numpy().astype(float).reshape(model.worlds, -1, 3)[:, nodes]
-        return values[0] if model.worlds == 1 else values
+        values = [np.zeros((model.worlds, 0, 3))]
+        if model.scene.obstacles:
+            nodes = np.concatenate(
+                [
+                    nodes
+                    for nodes, obstacle in zip(model.coupled.host.obstacles, model.scene.obstacles, strict=True)
+                    if obstacle.motion is not None
+                ]
+                or [np.zeros(0, int)]
+            )
+            values.append(self.coupled.q.numpy().astype(float).reshape(model.worlds, -1, 3)[:, nodes])
+        if any(body.shapes for body in model.scene.bodies):
+            values.append(shape_points(self))
+        result = np.concatenate(values, axis=1)
+        return result[0] if model.worlds == 1 else result
 
     def tangents(self, item: int | str | Sequence[int] | None = None) -> Floats:
         """Return unit tangents of edges (edges, 3) or (worlds, edges, 3), of all rods, or of rods chosen as in `points`."""
@@ -284,6 +298,15 @@ class State:
             values.append(polyline.material_directors(u, t, theta))
         result = model.order.edges(values, coupled, 3)
         return result if item is None or result is None else model.order.edges_of(item, result, 3)
+
+    def body(self, item: int | str) -> BodyState:
+        """Return pose and rates of a rigid body.
+
+        Args:
+            item: name, index or handle of the body.
+        """
+        names = [body.name for body in self.model.scene.bodies]
+        return body_state(self, named(BODY, item, names))
 
     def poses(self) -> Floats | None:
         """Return poses of grips (grips, 6) or (worlds, grips, 6) in the order of `model.grips`; None without."""

@@ -60,12 +60,14 @@ class UserNumbering:
 
     @cached_property
     def obstacles(self) -> Obstacles | None:
-        """Obstacles as surfaces; None without."""
+        """Obstacles, then the shapes of rigid bodies, as surfaces; None without."""
         scene = self.model.scene
-        if not scene.obstacles:
+        shapes = [(each.shape, each.name, each.motion is not None) for each in scene.obstacles]
+        shapes += [(shape, body.name, True) for body in scene.bodies for shape in body.shapes]
+        if not shapes:
             return None
         points = [batch.points.reshape(-1, 3) for batch in scene.batches] + [shell.points for shell in scene.shells]
-        return Obstacles.of(scene.obstacles, np.concatenate(points))
+        return Obstacles.of(shapes, np.concatenate([np.zeros((0, 3)), *points]))
 
     @cached_property
     def coupled_rows(self) -> tuple[np.ndarray, np.ndarray]:

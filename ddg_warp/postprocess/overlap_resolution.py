@@ -8,6 +8,7 @@ from ddg_warp.capture_lock import launches
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels.collision.contact.query import closest_kernel
 from ddg_warp.model import rod_shell_coupling
+from ddg_warp.model.rigid_bodies import refuse_rigid_bodies
 
 ROUNDS = 1000
 PART = 0.1  # default gap over the smallest activation distance
@@ -32,6 +33,7 @@ def resolve_overlaps(model, state, gap: float | None = None):
         SceneError: the scene has no contact, or the gap exceeds the activation distance.
         SolverError: pairs cannot be separated; the message names the closest.
     """
+    refuse_rigid_bodies("resolve_overlaps", model)
     touch = model.touch
     if touch is None:
         raise SceneError("resolve_overlaps: this scene has no contact; add scene.contact()")

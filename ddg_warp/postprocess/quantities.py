@@ -8,6 +8,7 @@ from ddg_warp import argument_checks, device_arrays
 from ddg_warp.capture_lock import launches
 from ddg_warp.kernels.terms import AXISYMMETRIC, MAGNETS, SHELLS
 from ddg_warp.model.model import Model, check_model
+from ddg_warp.model.rigid_bodies import body_energies
 from ddg_warp.model.state import State, query
 from ddg_warp.postprocess import end_moments
 from ddg_warp.postprocess.element_strains import coupled_strains, group_strains
@@ -33,6 +34,9 @@ def energies(model: Model, state: State) -> dict[str, float | Floats]:
         q, v = (values.reshape(model.worlds, -1) for values in (part.back(part.dofs(state)), part.rates(state)))
         kinetic += 0.5 * (part.mass.reshape(v.shape) * v * v).sum(1)
         potential -= (q * part.weight()).sum(1)
+    if model.scene.bodies:
+        rotational, more = body_energies(state)
+        kinetic, potential = kinetic + rotational, potential + more
     for force in model.coupled.user_forces if model.coupled is not None else ():
         if force.force.potential:
             result[force.name] = force.energy(state.coupled.q, state.time, model.coupled.blocks)

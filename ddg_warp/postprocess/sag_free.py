@@ -22,6 +22,7 @@ from ddg_warp.capture_lock import launches
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.densities.quadratic import quadratic
 from ddg_warp.model.model import check_model
+from ddg_warp.model.rigid_bodies import refuse_rigid_bodies
 from ddg_warp.model.state import query
 from ddg_warp.postprocess.element_strains import group_strains
 from ddg_warp.solve.equilibrium.rigid_modes import rigid_modes
@@ -59,6 +60,7 @@ def rest_strains(model, state=None, load: float = 1.0) -> dict[str, np.ndarray]:
         query("rest_strains", model, state)
     state, load = state or model.state(), argument_checks.number("rest_strains: load", load)
     _refuse("rest_strains", model)
+    refuse_rigid_bodies("rest_strains", model)
     tangent, result = Tangent(model), {}
     outer = tangent.loads(load, tangent.dofs(state))
     for part in tangent.parts:
@@ -92,6 +94,7 @@ def least_stiffness(model, state) -> np.ndarray:
     check_model("least_stiffness", model)
     query("least_stiffness", model, state)
     _refuse("least_stiffness", model)
+    refuse_rigid_bodies("least_stiffness", model)
     tangent, result = Tangent(model), np.zeros((model.worlds, model.scene.rod_count))
     forces = [_Elements.of(part, state).forces for part in tangent.parts]
     strained = sparse.block_diag([unit @ unit.T for unit in forces], format="csr")

@@ -21,8 +21,8 @@ class Handle(int):
     """Index of a rod, shell, body, support, load or obstacle of a scene, with kind and name.
 
     Attributes:
-        kind: "rod", "shell", "shell of revolution", "body", "obstacle", "support", "shell support", "ring support", "load", ...; the index
-            counts the objects of one kind.
+        kind: "rod", "shell", "shell of revolution", "body", "obstacle", "support", "shell support", "ring support", "load", ...; the
+            index counts the objects of one kind.
         name: as given to the scene, "" without.
     """
 

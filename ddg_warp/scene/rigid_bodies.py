@@ -115,7 +115,7 @@ class RigidBodies:
             center: centre of mass at rest (3,) [m], with `inertia`; by default of the shapes.
             velocity: initial velocity of the centre (3,) [m/s].
             angular_velocity: initial angular velocity (3,) [rad/s].
-            name: to ask for the body by; bodies of one name have common contact parameters.
+            name: name for queries; bodies of one name have common contact parameters.
 
         Attach rods and shells with `attach`. With `contact` the shapes collide with rods, shells, obstacles and other bodies, but not
         with the rods and shells that the body carries, nor with bodies that a joint connects to it.
@@ -134,7 +134,7 @@ class RigidBodies:
             raise SceneError("add_body: give either density or mass")
         if not shapes and (density is not None or inertia is None or center is None):
             raise SceneError("add_body: without shapes, give mass, inertia and center")
-        if inertia is None and center is not None or density is not None and inertia is not None:
+        if (inertia is None and center is not None) or (density is not None and inertia is not None):
             raise SceneError(
                 "add_body: center and inertia belong to a mass; leave them to the shapes, or give mass and inertia"
             )

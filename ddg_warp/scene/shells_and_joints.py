@@ -350,9 +350,9 @@ class Structures(Meridians, Magnets, Contacts):
             vertices: as many as nodes; none for a body.
             frame: for a body: True (default) clamps the rod by its frame at the nodes, as a rigid joint does; False leaves a ball
                 joint. A shell has a ball joint at each vertex, so that two vertices leave a hinge.
-            spin: for a shell: "glued" (default) couples the twist of rod edges on mesh edges to the shell (rod-shell coupling). The directors of such an
-                edge rotate about it with the surface, at the same angle as at rest. Two triangles act by their mean,
-                which leaves the stiffness of a fold along the rod unchanged. "free" leaves the twist uncoupled.
+            spin: for a shell: "glued" (default) couples the twist of rod edges on mesh edges to the shell (rod-shell coupling). The
+                directors of such an edge rotate about it with the surface, at the same angle as at rest. Two triangles act by their
+                mean, which leaves the stiffness of a fold along the rod unchanged. "free" leaves the twist uncoupled.
 
         The coupling constrains only rotation about the edge. A rod off the mesh edges (a post, a line from a vertex) has a ball joint
         and may spin; a rod without twist has no spin. With bending "midedge_dof" the mid-edge normal rotates the rod, on any mesh.

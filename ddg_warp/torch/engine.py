@@ -19,6 +19,7 @@ from ddg_warp.capture_lock import alone
 from ddg_warp.kernels.adjoint.time_step import flag_kernels, requested_kernels, smooth_kernel
 from ddg_warp.model.controls import Controls
 from ddg_warp.model.rebuild import ModelBuilder
+from ddg_warp.model.rigid_bodies import refuse_rigid_bodies
 from ddg_warp.model.state import Sliding
 from ddg_warp.solve.equilibrium import statics
 from ddg_warp.solve.stepping.graph_cache import Graphs
@@ -53,6 +54,7 @@ class Engine:
     """
 
     def __init__(self, source, worlds: int, scheme: str, options: dict):
+        refuse_rigid_bodies("Simulator", source)
         recipe = ModelBuilder(source, worlds)
         self.model = model = recipe.build()
         self._version = recipe.version

@@ -26,35 +26,31 @@ def _laws(real, n):
         return theta - wp.min(wp.max(theta, p[14]), p[15])
 
     @wp.func
+    def stiffness(p: P):
+        return E(p[0], p[1], p[2], p[3], p[4], p[5])
+
+    @wp.func
+    def strain(e: E, p: P):
+        """Return the strains less those at rest."""
+        return e - E(p[6], p[7], p[8], p[9], p[10], p[11])
+
+    @wp.func
     def energy(e: E, p: P):
-        total = real(0.0)
-        for i in range(6):
-            strain = e[i] - p[6 + i]
-            total += real(0.5) * p[i] * strain * strain
-        theta = e[wp.static(ANGLE)]
-        moved = theta - p[17 + wp.static(ANGLE)]
-        over = beyond(theta, p)
-        return total + real(0.5) * p[12] * p[23] * moved * moved - p[13] * theta + real(0.5) * p[16] * over * over
+        d, theta = strain(e, p), e[wp.static(ANGLE)]
+        moved, over = theta - p[17 + wp.static(ANGLE)], beyond(theta, p)
+        of_angle = p[12] * p[23] * moved * moved + p[16] * over * over
+        return real(0.5) * (wp.dot(d, wp.cw_mul(stiffness(p), d)) + of_angle) - p[13] * theta
 
     @wp.func
     def slope(e: E, p: P):
-        f = E()
-        for i in range(6):
-            f[i] = p[i] * (e[i] - p[6 + i])
-        theta = e[wp.static(ANGLE)]
-        f[wp.static(ANGLE)] = (
-            f[wp.static(ANGLE)] + p[12] * p[23] * (theta - p[17 + wp.static(ANGLE)]) - p[13] + p[16] * beyond(theta, p)
-        )
-        return f
+        f, theta = wp.cw_mul(stiffness(p), strain(e, p)), e[wp.static(ANGLE)]
+        damping = p[12] * p[23] * (theta - p[17 + wp.static(ANGLE)])
+        return E(f[0], f[1], f[2], f[3], f[4], f[5] + damping - p[13] + p[16] * beyond(theta, p))
 
     @wp.func
     def curvature(e: E, p: P):
-        c = E()
-        for i in range(6):
-            c[i] = p[i]
         stops = wp.where(beyond(e[wp.static(ANGLE)], p) == real(0.0), real(0.0), p[16])
-        c[wp.static(ANGLE)] = c[wp.static(ANGLE)] + p[12] * p[23] + stops
-        return c
+        return E(p[0], p[1], p[2], p[3], p[4], p[5] + p[12] * p[23] + stops)
 
     return energy, slope, curvature
 

@@ -319,7 +319,7 @@ def balance_kernel(real, linear, quadratic: bool, contact: bool, serial: bool):
 
     `balance`: write residual and energy change of the blocks `some`, or of all if empty.
     """
-    V, Meeting = wp.types.vector(3, real), meeting_type(real, linear)
+    Meeting = meeting_type(real, linear)
     Given, Found, F = inputs_type(real, quadratic), results_type(real, linear), wp.types.matrix((3, 3), real)
     until = until_function(serial)
     (outer, settle), add = residual_functions(real, linear, quadratic, contact), elements_function(real, linear)

@@ -57,7 +57,7 @@ def balance_kernel(real, linear, quadratic: bool, contact: bool):
 
     Carried nodes have no residual of their own; their energy changes stay with them.
     """
-    V, Meeting, Bodies = wp.types.vector(3, real), meeting_type(real, linear), bodies_type(real)
+    Meeting, Bodies = meeting_type(real, linear), bodies_type(real)
     Given, Found, H = inputs_type(real, quadratic), results_type(real, linear), wp.types.vector(3, linear)
     (outer, settle), add = residual_functions(real, linear, quadratic, contact), elements_function(real, linear)
 
@@ -187,7 +187,7 @@ def contact_kernels(real, linear):
     `condense`: add the diagonal blocks of carried nodes to those of the bodies.
     `condense_product`: add products at carried nodes to those of the bodies.
     """
-    V, M, H = wp.types.vector(3, real), wp.types.matrix((3, 3), linear), wp.types.vector(3, linear)
+    M, H = wp.types.matrix((3, 3), linear), wp.types.vector(3, linear)
     Bodies, PairSet, total = bodies_type(real), set_struct(real, linear), total_function(real, linear)
     _, free = product_functions(linear)
 

@@ -28,7 +28,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.core.islands import INVERSE_STEP, INERTIA_COEFFICIENT, STATUS, STEP_PROGRESS, SUBSTEP_ACCEPTED
+from ddg_warp.kernels.core.islands import INERTIA_COEFFICIENT, INVERSE_STEP, STEP_PROGRESS, SUBSTEP_ACCEPTED
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.measures.joint_curvature_twist import rotations
 

@@ -8,7 +8,8 @@ from ddg_warp.compile.boundary_conditions import pose_starts
 def number_bodies(host) -> tuple[np.ndarray, int]:
     """Return the body of every block, and the largest number of bodies.
 
-    A body is a rod, a shell or a rigid body; joined ones, carried rods and shells with their rigid bodies, have one number. -1 for none.
+    A body is a rod, a shell or a rigid body. Joined bodies, and rigid bodies with the rods and shells that they carry, have one number;
+    -1 for none.
     """
     ccd_body = np.full(host.blocks, -1, np.int32)
     count = 0

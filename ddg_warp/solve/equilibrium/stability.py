@@ -15,6 +15,7 @@ from ddg_warp import argument_checks
 from ddg_warp.compile.precision import lost_in_rounding
 from ddg_warp.errors import SceneError
 from ddg_warp.model.model import Model, check_model
+from ddg_warp.model.rigid_bodies import refuse_rigid_bodies
 from ddg_warp.model.state import State, query
 from ddg_warp.solve.equilibrium.rigid_modes import rigid_modes
 from ddg_warp.solve.equilibrium.tangent import Tangent
@@ -95,6 +96,7 @@ def spectrum(
         raise SceneError(f"spectrum: tangent is {argument_checks.shown(tangent)}; give Tangent(model), or leave it out")
     load = None if load is None else argument_checks.number("spectrum: load", load)
     lost_in_rounding(model, state=state)
+    refuse_rigid_bodies("spectrum", model)
     tangent = tangent or Tangent(model)
     free = np.flatnonzero(tangent.free)
     stiffness = tangent.stiffness(state, load)
@@ -344,6 +346,7 @@ def buckling(model: Model, free: State, loaded: State, count: int = 1) -> Floats
     for state in (loaded, free):
         query("buckling", model, state)
     argument_checks.count("buckling: count", count)
+    refuse_rigid_bodies("buckling", model)
     tangent = Tangent(model)
     dofs = np.flatnonzero(tangent.free)
     whole = tangent.stiffness(free)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-
 CARRIED = 8  # bit of nodes that a rigid body carries: without dofs of their own, but active with the body
 
 

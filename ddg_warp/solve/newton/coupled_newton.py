@@ -55,8 +55,8 @@ class CoupledNewton:
 
     Attributes:
         `sparsity`, `substructuring`: `SparseSystem` and, with substructuring, `RodSubstructuring`.
-        `frozen`, `planes`, `edge_rotations`, `contact`, `sleeping`, `relaxed`, `rigid_bodies`: components that not all models and options need, or
-            None.
+        `frozen`, `planes`, `edge_rotations`, `contact`, `sleeping`, `relaxed`, `rigid_bodies`: components that not all models and
+            options need, or None.
         krylov: conjugate gradients; None if substructuring is exact.
     """
 

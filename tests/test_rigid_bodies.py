@@ -1,0 +1,344 @@
+"""Rigid bodies: free flight, joints, carried rods and contact, against closed forms and small eigenvalue problems.
+
+Reference values were computed by a program of their own, from elliptic integrals, the heavy top's quadratic equation and 6 x 6
+eigenvalue problems of a body on a beam.
+"""
+
+import numpy as np
+import pytest
+
+import ddg_warp as ddg
+
+GRAVITY = 9.81  # m/s^2
+# Rod of the references: radius, length [m], Young's modulus [Pa], Poisson's ratio; of vanishing density
+RADIUS, LENGTH, YOUNG, POISSON = 2e-3, 0.2, 1e7, 0.5
+
+
+def build(scene, **options):
+    """Return model, integrator and start."""
+    model = scene.build(device="cpu")
+    return model, ddg.Integrator(model, **options), model.state()
+
+
+def crossings(time, values) -> np.ndarray:
+    """Return the times at which values rise through zero, linear in between."""
+    k = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
+    return time[k] - values[k] / (values[k + 1] - values[k]) * (time[1] - time[0])
+
+
+def total_momentum(model, state) -> np.ndarray:
+    """Return the angular momentum of all bodies about the origin (3,)."""
+    result = state.coupled.momentum.numpy().sum(0)
+    for index, body in enumerate(model.scene.bodies):
+        at = state.body(index)
+        result = result + body.mass * np.cross(at.position, at.velocity)
+    return result
+
+
+def reference_rod(scene, edges: int = 40):
+    """Add the rod of the references along x, of vanishing mass."""
+    points = np.linspace((0.0, 0.0, 0.0), (LENGTH, 0.0, 0.0), edges + 1)
+    material = ddg.Material(young=YOUNG, poisson=POISSON, density=1e-3)
+    return scene.add_rod(points, section=ddg.Circle(RADIUS), material=material)
+
+
+def test_free_asymmetric_top_flips_at_its_period(device):
+    """Flips of a top about its middle axis every 29.148726 s (Jacobi elliptic functions), to second order in the step."""
+    moments, rates, errors = np.array([2.0, 3.0, 4.0]), np.array([0.02, 1.0, 0.02]), []
+    for dt in (0.1, 0.05):
+        scene = ddg.Scene(gravity=(0, 0, 0))
+        body = scene.add_body(mass=1.0, inertia=moments, center=(0, 0, 0), angular_velocity=rates)
+        model = scene.build(device=device)
+        integrator, state, middle, energy = ddg.Integrator(model), model.state(), [], []
+        start = state.coupled.momentum.numpy()[0]
+        for _ in range(int(75.0 / dt)):
+            state = integrator.step(state, dt)
+            pose = state.body(body)
+            middle.append(pose.rotation[:, 1] @ pose.angular_velocity)
+            energy.append(model.energies(state)["kinetic"])
+        time, middle = dt * (1 + np.arange(len(middle))), np.array(middle)
+        flips = np.sort(np.append(crossings(time, middle), crossings(time, -middle)))
+        errors.append(np.diff(flips)[0] / 29.148726 - 1.0)
+        assert np.abs(state.coupled.momentum.numpy()[0] - start).max() < 1e-12
+        exact = 0.5 * moments @ rates**2
+        assert np.abs(np.array(energy) / exact - 1.0).max() < 3e-4
+    assert abs(errors[0]) < 1e-3
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
+
+
+def heavy_top(scheme: str, dt: float, turns: float = 1.0) -> tuple[float, float]:
+    """Return rate of precession [rad/s] and nutation, as cosine of the final angle, of a top in steady precession."""
+    moment, about, mass, length, angle, rate = 0.012, 0.002, 1.0, 0.1, np.pi / 3, 5.97659
+    axis = np.array([np.sin(angle), 0.0, np.cos(angle)])
+    across = np.array([np.cos(angle), 0.0, -np.sin(angle)])
+    axes = np.stack([across, [0.0, 1.0, 0.0], axis], axis=1)
+    central = np.array([moment - mass * length**2] * 2 + [about])
+    precession = np.array([0.0, 0.0, rate])
+    spin = precession + (100.0 - precession @ axis) * axis
+    scene = ddg.Scene()
+    body = scene.add_body(
+        mass=mass, inertia=axes * central @ axes.T, center=length * axis, angular_velocity=spin, name="top"
+    )
+    scene.ball(body, point=(0, 0, 0))
+    _model, integrator, state = build(scene, scheme=scheme)
+    places = []
+    for _ in range(int(turns / dt)):
+        state = integrator.step(state, dt)
+        places.append(state.body("top").position)
+    places = np.array(places)
+    azimuth = np.unwrap(np.arctan2(places[:, 1], places[:, 0]))
+    return azimuth[-1] / turns, places[-1, 2] / length
+
+
+def test_heavy_top_precesses_steadily():
+    """Steady precession w of I3 s w - (I1 - I3) w^2 cos(a) = m g l at a spin s of 100 rad/s: 5.97659 rad/s."""
+    errors = [heavy_top("implicit_midpoint", dt)[0] / 5.97659 - 1.0 for dt in (2e-3, 1e-3)]
+    assert abs(errors[1]) < 1e-4
+    assert np.log2(errors[0] / errors[1]) >= 1.9
+    rate, height = heavy_top("implicit_euler", 5e-4)
+    assert abs(rate / 5.97659 - 1.0) < 1.2e-2
+    assert height == pytest.approx(np.cos(np.pi / 3), abs=5e-3)
+
+
+def test_physical_pendulum_has_its_period():
+    """T = 4 K(sin(a/2)) sqrt(I / (m g l)) = 0.957183 s of a box of .02 x .04 x .3 m at an amplitude a of 1 rad."""
+    dt, c, s = 5e-3, np.cos(1.0), np.sin(1.0)
+    turn = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+    scene = ddg.Scene()
+    box = ddg.Box(turn @ [0, 0, -0.15], (0.01, 0.02, 0.15), rotation=turn)
+    body = scene.add_body(box, density=1000.0)
+    scene.hinge(body, point=(0, 0, 0), axis=(0, 1, 0))
+    model, integrator, state = build(scene, scheme="implicit_midpoint")
+    x, energy = [], model.energies(state)
+    for _ in range(int(5.0 / dt)):
+        state = integrator.step(state, dt)
+        x.append(state.body(body).position[0])
+    period = np.diff(crossings(dt * (1 + np.arange(len(x))), np.array(x))).mean()
+    assert abs(period / 0.957183 - 1.0) < 1.5e-4
+    after = model.energies(state)
+    swing = 0.24 * GRAVITY * 0.15 * (1.0 - c)  # m g l (1 - cos a) [J]
+    assert after["kinetic"] + after["gravity"] == pytest.approx(energy["kinetic"] + energy["gravity"], abs=2e-3 * swing)
+
+
+def two_bodies(**drive):
+    """Return a scene of two free bodies, 5e-3 and 2e-3 kg m^2, with a hinge along z between them."""
+    scene = ddg.Scene(gravity=(0, 0, 0))
+    bodies = [
+        scene.add_body(mass=1.0, inertia=(moment,) * 3, center=(0, 0, z), name=name)
+        for name, moment, z in (("a", 5e-3, -0.05), ("b", 2e-3, 0.05))
+    ]
+    scene.hinge(*bodies, point=(0, 0, 0), axis=(0, 0, 1), **drive)
+    return scene
+
+
+def test_torque_between_two_bodies():
+    """w_a = -t tau / I_a and w_b = t tau / I_b; the angle counts turns."""
+    _model, integrator, state = build(two_bodies(torque=0.01))
+    for _ in range(1000):
+        state = integrator.step(state, 0.01)
+    assert state.body("a").angular_velocity == pytest.approx([0, 0, -0.01 * 10.0 / 5e-3], abs=1e-9 * 20.0)
+    assert state.body("b").angular_velocity == pytest.approx([0, 0, 0.01 * 10.0 / 2e-3], abs=1e-9 * 50.0)
+
+
+def test_angle_motor_between_two_bodies():
+    """w_a = -I_b phi' / (I_a + I_b) for phi = 5 t^2; implicit Euler lags by h / 2t, and momentum stays zero."""
+    for dt in (1e-2, 5e-3):
+        model, integrator, state = build(two_bodies(angle=lambda t: 5.0 * t * t))
+        for _ in range(round(1.0 / dt)):
+            state = integrator.step(state, dt)
+        error = state.body("a").angular_velocity[2] / (-2e-3 * 10.0 / 7e-3) - 1.0
+        assert -error == pytest.approx(0.5 * dt, rel=0.1)
+        assert np.abs(total_momentum(model, state)).max() < 1e-12
+
+
+def test_damping_of_a_hinge():
+    """Angular rates of two bodies differ by w_0 exp(-c t (1/I_a + 1/I_b)), by implicit Euler by the product of its factors."""
+    damping, dt, steps = 3e-3, 0.01, 50
+    scene = ddg.Scene(gravity=(0, 0, 0))
+    pairs = (("a", 5e-3, -0.05, 0.0), ("b", 2e-3, 0.05, 4.0))
+    bodies = [
+        scene.add_body(mass=1.0, inertia=(moment,) * 3, center=(0, 0, z), angular_velocity=(0, 0, w), name=name)
+        for name, moment, z, w in pairs
+    ]
+    scene.hinge(*bodies, point=(0, 0, 0), axis=(0, 0, 1), damping=damping)
+    _model, integrator, state = build(scene)
+    for _ in range(steps):
+        state = integrator.step(state, dt)
+    difference = state.body("b").angular_velocity[2] - state.body("a").angular_velocity[2]
+    exact = 4.0 / (1.0 + damping * dt * (1 / 5e-3 + 1 / 2e-3)) ** steps
+    assert difference == pytest.approx(exact, rel=1e-9)
+
+
+def test_stops_of_a_hinge():
+    """A torque turns a body to its stop, where it rests at torque / stiffness beyond."""
+    scene = ddg.Scene(gravity=(0, 0, 0), mass_damping=5.0)
+    body = scene.add_body(mass=1.0, inertia=(5e-3,) * 3, center=(0, 0, 0))
+    scene.hinge(body, point=(0, 0, 0), axis=(0, 0, 1), torque=0.01, stops=(-1.0, 0.5))
+    _model, integrator, state = build(scene)
+    for _ in range(400):
+        state = integrator.step(state, 0.02)
+    turned = state.body(body).rotation
+    assert np.arctan2(turned[1, 0], turned[0, 0]) == pytest.approx(0.5, abs=1e-5)
+
+
+def flywheel(rate: float, tilt: float, dt: float, duration: float) -> float:
+    """Return the change of total momentum, relative, of a flywheel at a rate on a free body that turns by `tilt` [rad/s]."""
+    scene = ddg.Scene(gravity=(0, 0, 0))
+    frame = scene.add_body(mass=1.0, inertia=(1e-2, 2e-2, 1.5e-2), center=(0, 0, 0), angular_velocity=(tilt, 0, 0))
+    rates = {"velocity": (0, -0.1 * tilt, 0), "angular_velocity": (tilt, 0, rate)}
+    wheel = scene.add_body(mass=0.2, inertia=(1e-3, 1e-3, 2e-3), center=(0, 0, 0.1), **rates)
+    scene.hinge(frame, wheel, point=(0, 0, 0.1), axis=(0, 0, 1))
+    model, integrator, state = build(scene)
+    start = total_momentum(model, state)
+    for _ in range(round(duration / dt)):
+        state = integrator.step(state, dt)
+    return np.abs(total_momentum(model, state) - start).max() / np.abs(start).max()
+
+
+def test_flywheel_conserves_momentum():
+    """A flywheel that turns by 10 rad a step conserves momentum about its axis; while that turns, to first order in the step."""
+    assert flywheel(1000.0, 0.0, 0.01, 0.5) < 1e-12
+    errors = [flywheel(30.0, 0.3, dt, 0.1) for dt in (1e-3, 5e-4)]
+    assert errors[0] < 1e-3
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(1.0, abs=0.2)
+
+
+def test_cube_on_a_rod_swings():
+    """Lowest mode of a cube of .02 kg and 2 cm on a cantilever, 1.424329 rad/s; a point mass would give 1.534990."""
+    scene = ddg.Scene(gravity=(0, 0, 0))
+    rod = reference_rod(scene)
+    scene.clamp_end(rod, "first")
+    cube = scene.add_body(ddg.Box((LENGTH + 0.01, 0, 0), (0.01,) * 3), mass=0.02, velocity=(0, 0, 5e-3))
+    scene.attach(rod, [-1], cube)
+    _model, integrator, state = build(scene, scheme="implicit_midpoint")
+    dt, z = 5e-3, []
+    for _ in range(int(3.2 * 2.0 * np.pi / 1.424329 / dt)):
+        state = integrator.step(state, dt)
+        z.append(state.body(cube).position[2])
+    rate = 2.0 * np.pi / np.diff(crossings(dt * np.arange(len(z)), np.array(z))).mean()
+    assert rate == pytest.approx(1.424329, rel=5e-3)
+
+
+def test_two_cubes_on_a_twisted_rod():
+    """Two free cubes of moment I on a rod of torsional stiffness GJ / L: sqrt(2 GJ / (L I)) = 25.06628 rad/s."""
+    scene = ddg.Scene(gravity=(0, 0, 0))
+    rod = reference_rod(scene)
+    for end, x, rate in ((0, 0.0, 1.0), (-1, LENGTH, -1.0)):
+        cube = scene.add_body(ddg.Box((x, 0, 0), (0.01,) * 3), mass=0.02, angular_velocity=(rate, 0, 0))
+        scene.attach(rod, [end], cube)
+    _model, integrator, state = build(scene, scheme="implicit_midpoint")
+    dt, spin = 2e-3, []
+    for _ in range(int(3.2 * 2.0 * np.pi / 25.06628 / dt)):
+        state = integrator.step(state, dt)
+        spin.append(state.body(0).angular_velocity[0])
+    rate = 2.0 * np.pi / np.diff(crossings(dt * np.arange(len(spin)), np.array(spin))).mean()
+    assert rate == pytest.approx(25.06628, rel=2e-3)
+    assert np.abs(state.coupled.momentum.numpy().sum(0)).max() < 1e-12
+
+
+def payload(ratio: float):
+    """Return a scene with a body of `ratio` times the mass of a clamped rod on its end."""
+    scene = ddg.Scene()
+    points = np.linspace((0, 0, 0), (LENGTH, 0, 0), 41)
+    rod = scene.add_rod(points, section=ddg.Circle(RADIUS), material=ddg.Material(young=YOUNG, density=1000.0))
+    scene.clamp_end(rod, "first")
+    mass = ratio * 1000.0 * np.pi * RADIUS**2 * LENGTH
+    body = scene.add_body(mass=mass, inertia=(mass * 0.02**2 / 6,) * 3, center=(LENGTH, 0, 0))
+    scene.attach(rod, [-1], body)
+    return scene
+
+
+def test_newton_counts_at_mass_ratios():
+    """Mean Newton iterations a step differ by less than one for bodies of 1e-3 to 1e3 of the rod's mass."""
+    counts = []
+    for ratio in (1e-3, 1.0, 1e3):
+        _model, integrator, state = build(payload(ratio))
+        for _ in range(30):
+            state = integrator.step(state, 1e-3)
+        counts.append(integrator.statistics()["newton_iterations"]["mean"])
+    assert max(counts) - min(counts) <= 1.0
+
+
+@pytest.mark.parametrize("preconditioner", ["block_jacobi", "substructuring", "multilevel"])
+def test_preconditioners_agree(preconditioner):
+    """Conjugate gradients with every preconditioner step a rod between two bodies as the elimination does."""
+    results = []
+    for linear in ("auto", preconditioner):
+        scene = ddg.Scene()
+        rod = scene.add_rod(
+            np.linspace((0, 0, 0), (LENGTH, 0, 0), 21), section=ddg.Circle(RADIUS), material=ddg.Material(young=YOUNG)
+        )
+        for end, x in ((0, 0.0), (-1, LENGTH)):
+            body = scene.add_body(ddg.Box((x, 0.01, 0.005), (0.01, 0.02, 0.015)), density=1000.0)
+            scene.attach(rod, [end], body)
+        scene.ball(0, point=(0, 0, 0.02))
+        _model, integrator, state = build(scene, linear=linear, rtol=1e-10)
+        for _ in range(20):
+            state = integrator.step(state, 2e-3)
+        results.append(state.points())
+    assert np.abs(results[1] - results[0]).max() < 1e-7 * LENGTH
+
+
+def test_carried_masses_move_with_the_body():
+    """A free body that carries heavy rod ends has their moments of inertia, and total momentum stays."""
+    scene = ddg.Scene(gravity=(0, 0, 0))
+    spin = np.array([0.2, 0.1, 3.0])
+    body = scene.add_body(mass=0.1, inertia=(1e-4, 2e-4, 2.5e-4), center=(0, 0, 0), angular_velocity=spin)
+    scene.add_rod([(0.1, 0, 0), (0.2, 0, 0)], section=ddg.Circle(1e-2), material=ddg.Material(young=1e9), twist=False)
+    scene.attach(0, [0, 1], body, frame=False)
+    _model, integrator, state = build(scene)
+    half = 0.5 * 1000.0 * np.pi * 1e-4 * 0.1  # mass of each node [kg]
+    center = half * 0.3 / (0.1 + 2 * half)
+    assert state.body(body).position == pytest.approx([center, 0, 0])
+    spread = 0.1 * center**2 + half * ((0.1 - center) ** 2 + (0.2 - center) ** 2)
+    moments = np.array([1e-4, 2e-4 + spread, 2.5e-4 + spread])
+    start = state.coupled.momentum.numpy()[0]
+    assert start == pytest.approx(moments * spin)
+    for _ in range(50):
+        state = integrator.step(state, 0.01)
+    assert state.coupled.momentum.numpy()[0] == pytest.approx(start, abs=1e-13)
+
+
+def test_box_comes_to_rest_on_a_floor():
+    """A box that tumbles onto a rough floor ends on a face, with its weight carried by contacts."""
+    scene = ddg.Scene()
+    scene.add_obstacle(ddg.Plane(), name="floor")
+    box = ddg.Box((0, 0, 0.06), (0.02, 0.03, 0.05), radius=1e-3)
+    body = scene.add_body(box, density=1000.0, name="box", angular_velocity=(1.0, 0.5, 2.0))
+    scene.contact(friction=0.5)
+    model, integrator, state = build(scene)
+    for _ in range(200):
+        state = integrator.step(state, 2e-3)
+    pose = state.body(body)
+    assert np.abs(pose.velocity).max() < 1e-6
+    assert np.abs(pose.angular_velocity).max() < 1e-3
+    assert np.sort(np.abs(pose.rotation[2]))[:2] == pytest.approx([0.0, 0.0], abs=1e-4)  # a face is level
+    force = sum(contact for contact in model.contacts(state).force[:, 2])
+    assert abs(force) == pytest.approx(0.24 * GRAVITY, rel=1e-3)
+
+
+@pytest.mark.parametrize("turn", [1 / 6, 1 / 2])
+@pytest.mark.parametrize("place", [0.05, 0.19, 0.198])
+def test_bar_turns_past_no_rod(turn, place):
+    """A bar of .2 m that would turn by a part of a turn in a step stops at a rod in its way, near its axis or at its end."""
+    dt, angle = 0.01, 2.0 * np.pi * turn
+    middle = 0.5 * angle
+    scene = ddg.Scene(gravity=(0, 0, 0))
+    x, y = place * np.cos(middle), place * np.sin(middle)
+    rod = scene.add_rod(
+        np.linspace((x, y, -0.05), (x, y, 0.05), 9), section=ddg.Circle(1e-3), material=ddg.Material(young=1e9)
+    )
+    scene.clamp_end(rod, "first")
+    scene.clamp_end(rod, "last")
+    bar = scene.add_body(
+        ddg.Capsule((0, 0, 0), (0.2, 0, 0), 1e-3), density=100.0, name="bar", angular_velocity=(0, 0, angle / dt)
+    )
+    scene.hinge(bar, point=(0, 0, 0), axis=(0, 0, 1))
+    scene.contact()
+    _model, integrator, state = build(scene)
+    for _ in range(3):
+        state = integrator.step(state, dt)
+        turned = state.body(bar).rotation
+        rod_at = state.points()[4]
+        lag = np.arctan2(turned[1, 0], turned[0, 0]) - np.arctan2(rod_at[1], rod_at[0])
+        assert -np.pi < lag < 0.0
