@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
+from ddg_warp import stability
 
 GRAVITY = 9.81  # m/s^2
 # Rod of the references: radius, length [m], Young's modulus [Pa], Poisson's ratio; of vanishing density
@@ -342,3 +343,66 @@ def test_bar_turns_past_no_rod(turn, place):
         rod_at = state.points()[4]
         lag = np.arctan2(turned[1, 0], turned[0, 0]) - np.arctan2(rod_at[1], rod_at[0])
         assert -np.pi < lag < 0.0
+
+
+def cube_on_cantilever(weight: float, **options):
+    """Return a scene of the reference rod, clamped, with a cube of a weight [N] on its end."""
+    scene = ddg.Scene(gravity=(0, 0, -weight / 0.02), **options)
+    rod = reference_rod(scene)
+    scene.clamp_end(rod, "first")
+    cube = scene.add_body(ddg.Box((LENGTH + 0.01, 0, 0), (0.01,) * 3), mass=0.02, name="cube")
+    scene.attach(rod, [-1], cube)
+    return scene
+
+
+def test_spectra_of_bodies_on_rods():
+    """Modes of a cube on a cantilever, 1.424329 and 46.78923 rad/s, in two planes; and of two cubes on a twisted rod."""
+    model = cube_on_cantilever(0.0).build(device="cpu")
+    rates = stability.spectrum(model, model.state(), count=8).frequencies
+    assert rates[[0, 1]] == pytest.approx([1.424329] * 2, rel=5e-3)
+    assert rates[[3, 4]] == pytest.approx([46.78923] * 2, rel=5e-3)
+    scene = ddg.Scene(gravity=(0, 0, 0))
+    rod = reference_rod(scene)
+    for end, x in ((0, 0.0), (-1, LENGTH)):
+        scene.attach(rod, [end], scene.add_body(ddg.Box((x, 0, 0), (0.01,) * 3), mass=0.02))
+    model = scene.build(device="cpu")
+    rates = stability.spectrum(model, model.state(), count=12).frequencies
+    assert np.nan_to_num(rates[:6]) == pytest.approx(np.zeros(6), abs=1e-4)
+    assert rates[6] == pytest.approx(25.06628, rel=2e-3)
+
+
+def test_equilibria_of_bodies_on_rods():
+    """Small deflection W (L^3 / 3 + a L^2 + a^2 L) / EI of a weight W at the arm a; large ones as damped motion reaches them."""
+    stiffness, arm, weight = YOUNG * np.pi * RADIUS**4 / 4, 0.01, 1e-6
+    state = ddg.statics.solve(cube_on_cantilever(weight).build(device="cpu"))
+    small = weight * (LENGTH**3 / 3 + arm * LENGTH**2 + arm**2 * LENGTH) / stiffness
+    assert -state.body("cube").position[2] == pytest.approx(small, rel=1e-3)
+    model = cube_on_cantilever(2e-3).build(device="cpu")
+    state = ddg.statics.solve(model)
+    assert state.stable
+    damped, integrator, reached = build(cube_on_cantilever(2e-3, mass_damping=3.0))
+    for _ in range(500):
+        reached = integrator.step(reached, 0.03)
+    assert np.abs(reached.points() - state.points()).max() < 1e-6 * LENGTH
+    assert damped.energies(reached)["gravity"] == pytest.approx(model.energies(state)["gravity"], rel=1e-5)
+
+
+def test_stability_of_a_pinned_body():
+    """A body of weight W above its pin, held by a spring k at the height a, stands if k a^2 > W l."""
+    for stiffness, stands in ((60.0, True), (40.0, False)):
+        scene = ddg.Scene(gravity=(0, 0, -10.0))
+        body = scene.add_body(mass=1.0, inertia=(1e-3,) * 3, center=(0, 0, 0.5))  # W l = 5 N m
+        scene.hinge(body, point=(0, 0, 0), axis=(0, 1, 0))
+        for x in (-1.0, 1.0):  # two springs of half the stiffness at a height of sqrt(.1) m
+            spring = scene.add_rod(
+                [(x, 0, np.sqrt(0.1)), (0, 0, np.sqrt(0.1))],
+                section=ddg.Stiffness(EA=0.5 * stiffness, EI1=0.0, mass_per_length=1e-9),
+                bend=False,
+            )
+            scene.fix(spring, [0])
+            scene.attach(spring, [-1], body, frame=False)
+        model = scene.build(device="cpu")
+        rates = stability.spectrum(model, model.state(), count=1, load=1.0).eigenvalues
+        assert (rates[0] > 0.0) == stands
+        moment = 1e-3 + 0.25
+        assert rates[0] == pytest.approx((0.1 * stiffness - 5.0) / moment, rel=1e-6)

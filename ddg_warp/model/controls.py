@@ -135,6 +135,11 @@ def require_acting(model, names) -> None:
             "Controls: a magnetic field acts on nothing; magnetise rods by scene.magnetize, and add scene.magnetic_field((0, 0, 0)) to "
             "which it adds"
         )
+    pinned = [joint.second for joint in model.scene.body_joints if joint.first < 0]
+    if "gravity" in names and pinned:
+        raise SceneError(
+            f"Controls: gravity: body {pinned[0]} is joined to the world, and its weight is that of the scene's gravity; leave gravity out"
+        )
     if "poses" in names and not model.grips:
         raise SceneError(
             "Controls: poses of no grip; hold something by Grip(...), as in scene.clamp(rod, motion=Grip())"

@@ -14,6 +14,7 @@ from ddg_warp.kernels.elements.coupled_element import coupled_storage, linear_st
 from ddg_warp.model import validate
 from ddg_warp.scene.grip import Grip
 from ddg_warp.solve.collision import exact_hessian
+from ddg_warp.solve.equilibrium.carried_dofs import CarriedDofs
 from ddg_warp.solve.equilibrium.rigid_modes import Body
 from ddg_warp.solve.equilibrium.tangent_part import TangentBlock
 from ddg_warp.solve.forces.prescribed_element_data import CoupledMotion
@@ -35,6 +36,7 @@ class CoupledTangent(TangentBlock):
         self.rate = model.coupled.still  # inverse time of strain-rate damping: zero at rest
         self.given_field = np.zeros((worlds, 3))  # field of controls, added to the scene's [T]
         self.planes = HostPlanes(host, worlds) if host.frames else None
+        self.carried = CarriedDofs(host, worlds) if host.rigid_bodies else None
         self._anchored = host.fixed[: host.nodes].copy()
         for shell in host.shells:
             self._anchored[shell.nodes] = True
@@ -54,6 +56,11 @@ class CoupledTangent(TangentBlock):
         return forces, blocks, islands
 
     def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
+        result = self.nodal_loads(factor, q)
+        return self.carried.condense(q, result) if self.carried else result
+
+    def nodal_loads(self, factor: float, q: np.ndarray) -> np.ndarray:
+        """Return external forces (size,) with those of carried nodes on these nodes."""
         result = super().loads(factor, q)
         if not self.coupled.user_forces:
             return result
@@ -61,7 +68,22 @@ class CoupledTangent(TangentBlock):
         forces.evaluate(blocks, islands)
         return result + self.into(forces.total.numpy().astype(float).ravel())
 
+    def work(self, factor: float, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """Return the work of mean external forces on every dof between two dof vectors (size,) [J]."""
+        return 0.5 * (self.nodal_loads(factor, before) + self.nodal_loads(factor, after)) * (after - before)
+
+    def spread(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Return a step with displacements of carried nodes."""
+        return self.carried.spread(q, step) if self.carried else step
+
     def load_stiffness(self, factor: float, q: np.ndarray) -> sparse.csc_matrix | None:
+        result = self._nodal_load_stiffness(factor, q)
+        if not self.carried:
+            return result
+        geometric = self.carried.geometric(q, -self.nodal_loads(factor, q))
+        return geometric if result is None else self.carried.matrix(q, result) + geometric
+
+    def _nodal_load_stiffness(self, factor: float, q: np.ndarray) -> sparse.csc_matrix | None:
         result = super().load_stiffness(factor, q)
         if not self.coupled.user_forces:
             return result
@@ -107,6 +129,10 @@ class CoupledTangent(TangentBlock):
 
     def elastic_gradient(self, state) -> np.ndarray:
         """Return the energy gradient without contact."""
+        result = self._nodal_gradient(state)
+        return self.carried.condense(self.dofs(state), result) if self.carried else result
+
+    def _nodal_gradient(self, state) -> np.ndarray:
         result = np.zeros((self.size // 3, 3))
         for i, part in enumerate(self.coupled.sets):
             slots, forces = part.host.slots, self.forces(state, i)
@@ -158,11 +184,14 @@ class CoupledTangent(TangentBlock):
         if self.model.touch:
             self.model.touch.evaluate(state.coupled.q, state.coupled.rate)
             elastic = elastic + exact_hessian.hessian(self.model.touch.terms, state.coupled.q)
+        if self.carried:
+            q = self.dofs(state)
+            elastic = self.carried.matrix(q, elastic) + self.carried.geometric(q, self._nodal_gradient(state))
         return self.matrix(elastic)
 
     def linear_stress(self, state, step: np.ndarray) -> list:
         """Return the stresses (strains, elements) of every set at the strains e + J step."""
-        result = []
+        result, step = [], self.spread(self.dofs(state), step)
         change = wp.array(self.back(step).reshape(-1, 3), dtype=self.coupled.vector, device=self.coupled.device)
         for i, part in enumerate(self.coupled.sets):
             shape = (len(part.term.measure.strains), part.elements * self.coupled.worlds)
@@ -187,6 +216,8 @@ class CoupledTangent(TangentBlock):
         return self.into(state.coupled.v.numpy().astype(np.float64).ravel())
 
     def assign(self, state, q: np.ndarray) -> None:
+        if self.carried:
+            self.carried.turn(state.coupled, q)
         state.coupled.q.assign(self.back(q).reshape(-1, 3))
 
     def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -196,6 +227,9 @@ class CoupledTangent(TangentBlock):
         """
         q, step = self.back(q), self.back(step)
         moved = q + step
+        if self.carried:
+            moved = self.carried.place(q, moved)
+            step = moved - q
         x, dx, out = (v.reshape(self.coupled.worlds, -1, 3) for v in (q, step, moved))
         order = [self.host.rods[i] for level in self.host.rod_order.levels for i in level]
         for world in range(self.coupled.worlds):
@@ -314,19 +348,25 @@ class CoupledTangent(TangentBlock):
         """Return rods with the rotations of rigid joints, shells, and shells of revolution, of every world."""
         host, none = self.host, np.zeros(0, int)
         joints = [part for part in host.sets if part.term.measure.spins]
-        parts = []
+        parts, carried = [], np.zeros(host.blocks, bool)
+        if (rigid := host.rigid_bodies) is not None:
+            carried[rigid.carried] = True
         for rod in host.rods:
             edges = rod.all_edges
             ends = np.stack([np.arange(len(edges)), (np.arange(len(edges)) + 1) % len(rod.all_nodes)], axis=1)
             spins = [part.slots[-1, np.isin(part.slots[-2], edges)] for part in joints]
             parts.append((rod.all_nodes, edges, ends, np.unique(np.concatenate([none, *spins]))))
         parts += [(body.nodes, none, np.zeros((0, 2), int), none) for body in (*host.shells, *host.meridians)]
+        if rigid is not None:
+            pairs = zip(rigid.origins, rigid.spins, strict=True)
+            parts += [(np.array([origin]), none, np.zeros((0, 2), int), np.array([spin])) for origin, spin in pairs]
         result = []
         for world in range(self.coupled.worlds):
             dofs = self.offset + 3 * world * host.blocks
             for nodes, edges, ends, spins in parts:
                 places = (dofs + 3 * blocks[:, None] + np.arange(3) for blocks in (nodes, spins))
-                nodes, spins = places
+                at, spins = places
+                nodes = np.where(carried[nodes][:, None], -1, at)
                 result.append(Body(nodes, dofs + 3 * edges, ends, spins))
         return result
 
@@ -344,6 +384,12 @@ class CoupledTangent(TangentBlock):
         for i, meridian in enumerate(self.host.meridians):
             if block in meridian.nodes:
                 return f"node {int(np.flatnonzero(meridian.nodes == block)[0])} of axisymmetric shell {i}"
+        if (rigid := self.host.rigid_bodies) is not None:
+            for blocks in (rigid.origins, rigid.spins, rigid.centers):
+                if block in blocks:
+                    return f"body {int(np.argmax(blocks == block))}"
+            if block in rigid.carried:
+                return f"a node of body {rigid.owner[np.argmax(rigid.carried == block)]}"
         return f"joint {block - self.host.nodes - self.host.angles}"
 
     def _launch(self, state, index: int, kernel: int, out: wp.array, columns: tuple, *more) -> None:

@@ -214,7 +214,10 @@ class Search:
 
     def change(self, before: Iterate, after: Iterate) -> np.ndarray:
         """Return the change of the potential (islands,) [J], with work by mean follower loads."""
-        work = 0.5 * (before.outer + after.outer) * (after.q - before.q)
+        if self.tangent.carries:
+            work = self.tangent.work(self.load_factor, before.q, after.q)
+        else:
+            work = 0.5 * (before.outer + after.outer) * (after.q - before.q)
         elastic = self.tangent.island_energies(after.energies - before.energies)
         return elastic - np.bincount(self.tangent.island, work, self.tangent.islands)
 

@@ -96,15 +96,18 @@ def spectrum(
         raise SceneError(f"spectrum: tangent is {argument_checks.shown(tangent)}; give Tangent(model), or leave it out")
     load = None if load is None else argument_checks.number("spectrum: load", load)
     lost_in_rounding(model, state=state)
-    refuse_rigid_bodies("spectrum", model)
     tangent = tangent or Tangent(model)
     free = np.flatnonzero(tangent.free)
     stiffness = tangent.stiffness(state, load)
     weights = tangent.mass if metric == "mass" else np.where(tangent.angle, tangent.edge_length() ** 2, 1.0)
-    weights = weights[free]
+    zero_modes = rigid_modes(tangent, state, stiffness)
+    axes = None
+    if model.scene.bodies and metric == "mass":
+        axes, weights = _principal_axes(tangent, state, weights)
+        stiffness, zero_modes = axes.T @ stiffness @ axes, axes.T @ zero_modes
+    weights, zero_modes = weights[free], zero_modes[free]
     if not (weights > 0.0).any():
         raise SceneError("no free dof has a mass: give the material a density, or use metric='unit'")
-    zero_modes = rigid_modes(tangent, state, stiffness)[free]
     matrix = sparse.csc_matrix(stiffness[free][:, free])
     rigid = _normalised(zero_modes, weights)
     kept, zero = int((weights > 0.0).sum()), rigid.shape[1]
@@ -113,7 +116,8 @@ def spectrum(
         values, modes = _unsymmetric(matrix, weights, elastic_count + zero)
         kept_values = np.sort(np.argsort(np.abs(values))[zero:])  # without rigid modes, nonzero only by rounding
         values, modes = values[kept_values], modes[:, kept_values]
-    elif kept <= DENSE:
+    elif kept <= DENSE and not (model.scene.bodies and 2 * count < kept - zero):
+        # masses of bodies may exceed nodal masses by so much that a dense solver loses the lowest modes in rounding
         values, modes = dense(matrix, weights, zero_modes)
     else:
         values, modes = ShiftInvertLanczos(matrix, weights, zero_modes)(elastic_count)
@@ -125,8 +129,24 @@ def spectrum(
         negative = max(negative, instabilities(tangent, state, stiffness))
     full = np.zeros((tangent.size, min(count, len(values))), modes.dtype)
     full[free] = modes[:, :count]
+    if model.scene.bodies:
+        q = tangent.dofs(state)
+        full = np.array([tangent.spread(q, mode) for mode in (full if axes is None else axes @ full).T]).T
     displacements = np.array([tangent.at_points(mode) for mode in full.T])
     return Spectrum(values[:count], full, negative, zero, displacements)
+
+
+def _principal_axes(tangent: Tangent, state, masses: np.ndarray) -> tuple[sparse.csc_matrix, np.ndarray]:
+    """Return the basis (size, size) in which rotations of rigid bodies are about principal axes, and masses (size,) in it."""
+    part = tangent.parts[-1]
+    places, rotations, moments = part.carried.principal(state.coupled)
+    places, masses = part.offset + 3 * places, masses.copy()
+    masses[places[:, None] + np.arange(3)] = moments
+    row, column = np.indices((3, 3)).reshape(2, -1)
+    turns = rotations - np.eye(3)
+    at = (places[:, None] + row).ravel(), (places[:, None] + column).ravel()
+    turned = sparse.csc_matrix((turns.reshape(-1, 9).ravel(), at), shape=(tangent.size, tangent.size))
+    return sparse.identity(tangent.size, format="csc") + turned, masses
 
 
 def negative_eigenvalues(matrix: sparse.csc_matrix) -> int:

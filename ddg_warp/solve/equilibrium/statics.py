@@ -172,7 +172,8 @@ class Equilibrium:
 
     def __init__(self, model: Model, options: StaticsOptions | None = None):
         self.model, self.options = model, options or StaticsOptions()
-        refuse_rigid_bodies("statics", model)
+        if model.touch:
+            refuse_rigid_bodies("statics with contact", model)
         self.tangent = Tangent(model)
         rounding = self.options.floor_factor * model.types.eps
         self.residuals = Residuals(self.tangent, self.options.rtol, rounding)
@@ -452,7 +453,7 @@ class Equilibrium:
         for _ in range(20):
             candidate = moved_by(length)
             moved = tangent.dofs(candidate)
-            work = 0.5 * (tangent.loads(load_factor, q) + tangent.loads(load_factor, moved)) * (moved - q)
+            work = tangent.work(load_factor, q, moved)
             change = tangent.island_energies(tangent.element_energies(candidate) - energies)
             left = wanted & (change - np.bincount(island, work, tangent.islands) < -rounding_error)
             if (left | ~wanted).all():

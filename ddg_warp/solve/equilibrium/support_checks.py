@@ -26,7 +26,9 @@ def require_supports(model) -> None:
                     f"axisymmetric shell {i} is not supported along z: a static solve needs scene.hold_ring(...) or "
                     "scene.clamp_ring(...)"
                 )
-        spatial = np.setdiff1d(np.arange(host.nodes), [node for shell in host.meridians for node in shell.nodes])
+        carried = host.rigid_bodies.carried if host.rigid_bodies else ()
+        other = [*(node for shell in host.meridians for node in shell.nodes), *carried]
+        spatial = np.setdiff1d(np.arange(host.nodes), other)
         loose = np.flatnonzero(~host.holds[spatial].any(0)) if spatial.size else spatial
         if loose.size:
             raise SceneError(

@@ -121,6 +121,20 @@ class Tangent:
         """Return external forces (size,) [N, N m] at dofs q: constant loads times `factor`, others by amplitude."""
         return np.concatenate([part.loads(factor, self.of(part, q)) for part in self.parts])
 
+    def work(self, factor: float, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """Return the work of mean external forces on every dof between two dof vectors (size,) [J]."""
+        parts = self.parts
+        return np.concatenate([part.work(factor, self.of(part, before), self.of(part, after)) for part in parts])
+
+    def spread(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Return a step (size,) with displacements of the nodes that rigid bodies carry."""
+        return np.concatenate([part.spread(self.of(part, q), self.of(part, step)) for part in self.parts])
+
+    @property
+    def carries(self) -> bool:
+        """True if rigid bodies carry nodes, so that forces on dofs do work on more than these dofs."""
+        return bool(self.model.scene.bodies)
+
     def load_stiffness(self, factor: float, q: np.ndarray) -> sparse.csc_matrix | None:
         """Return the load stiffness, minus the derivative of loads by q; None without follower loads."""
         blocks = [part.load_stiffness(factor, self.of(part, q)) for part in self.parts]
@@ -210,7 +224,8 @@ class Tangent:
         np.maximum.at(worst, self.island[self.angle], np.abs(direction[self.angle]))
         first = 0
         for part in self.parts:
-            edges, turns = (part.edges(self.of(part, v)) for v in (q, direction))
+            at, step = self.of(part, q), self.of(part, direction)
+            edges, turns = part.edges(at), part.edges(part.spread(at, step))
             length, turned = np.linalg.norm(edges, axis=1), np.linalg.norm(turns, axis=1)
             turn = np.divide(turned, length, out=np.zeros_like(turned), where=length > 0.0)
             islands = worst[first : first + part.islands]

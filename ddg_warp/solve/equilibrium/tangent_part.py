@@ -109,6 +109,14 @@ class TangentBlock:
                 _add(force, dofs, scale * load.forces(gathered(x, dofs)))
         return self.into(result.ravel())
 
+    def work(self, factor: float, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """Return the work of mean external forces on every dof between two dof vectors (size,) [J]."""
+        return 0.5 * (self.loads(factor, before) + self.loads(factor, after)) * (after - before)
+
+    def spread(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Return a step (size,) with displacements of dependent dofs, which only `CoupledTangent` has."""
+        return step
+
     def load_stiffness(self, factor: float, q: np.ndarray) -> sparse.csc_matrix | None:
         if not self.host.followers:
             return None
