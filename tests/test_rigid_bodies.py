@@ -4,6 +4,8 @@ Reference values were computed by a program of their own, from elliptic integral
 eigenvalue problems of a body on a beam.
 """
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -15,9 +17,18 @@ GRAVITY = 9.81  # m/s^2
 RADIUS, LENGTH, YOUNG, POISSON = 2e-3, 0.2, 1e7, 0.5
 
 
+DEVICE = "cpu"
+
+
+@pytest.fixture(autouse=True)
+def _build_there(device, monkeypatch):
+    """Let `build` take the device of the tests."""
+    monkeypatch.setattr(sys.modules[__name__], "DEVICE", device)
+
+
 def build(scene, **options):
     """Return model, integrator and start."""
-    model = scene.build(device="cpu")
+    model = scene.build(device=DEVICE)
     return model, ddg.Integrator(model, **options), model.state()
 
 
@@ -357,7 +368,7 @@ def cube_on_cantilever(weight: float, **options):
 
 def test_spectra_of_bodies_on_rods():
     """Modes of a cube on a cantilever, 1.424329 and 46.78923 rad/s, in two planes; and of two cubes on a twisted rod."""
-    model = cube_on_cantilever(0.0).build(device="cpu")
+    model = cube_on_cantilever(0.0).build(device=DEVICE)
     rates = stability.spectrum(model, model.state(), count=8).frequencies
     assert rates[[0, 1]] == pytest.approx([1.424329] * 2, rel=5e-3)
     assert rates[[3, 4]] == pytest.approx([46.78923] * 2, rel=5e-3)
@@ -365,7 +376,7 @@ def test_spectra_of_bodies_on_rods():
     rod = reference_rod(scene)
     for end, x in ((0, 0.0), (-1, LENGTH)):
         scene.attach(rod, [end], scene.add_body(ddg.Box((x, 0, 0), (0.01,) * 3), mass=0.02))
-    model = scene.build(device="cpu")
+    model = scene.build(device=DEVICE)
     rates = stability.spectrum(model, model.state(), count=12).frequencies
     assert np.nan_to_num(rates[:6]) == pytest.approx(np.zeros(6), abs=1e-4)
     assert rates[6] == pytest.approx(25.06628, rel=2e-3)
@@ -374,10 +385,10 @@ def test_spectra_of_bodies_on_rods():
 def test_equilibria_of_bodies_on_rods():
     """Small deflection W (L^3 / 3 + a L^2 + a^2 L) / EI of a weight W at the arm a; large ones as damped motion reaches them."""
     stiffness, arm, weight = YOUNG * np.pi * RADIUS**4 / 4, 0.01, 1e-6
-    state = ddg.statics.solve(cube_on_cantilever(weight).build(device="cpu"))
+    state = ddg.statics.solve(cube_on_cantilever(weight).build(device=DEVICE))
     small = weight * (LENGTH**3 / 3 + arm * LENGTH**2 + arm**2 * LENGTH) / stiffness
     assert -state.body("cube").position[2] == pytest.approx(small, rel=1e-3)
-    model = cube_on_cantilever(2e-3).build(device="cpu")
+    model = cube_on_cantilever(2e-3).build(device=DEVICE)
     state = ddg.statics.solve(model)
     assert state.stable
     damped, integrator, reached = build(cube_on_cantilever(2e-3, mass_damping=3.0))
@@ -401,8 +412,65 @@ def test_stability_of_a_pinned_body():
             )
             scene.fix(spring, [0])
             scene.attach(spring, [-1], body, frame=False)
-        model = scene.build(device="cpu")
+        model = scene.build(device=DEVICE)
         rates = stability.spectrum(model, model.state(), count=1, load=1.0).eigenvalues
         assert (rates[0] > 0.0) == stands
         moment = 1e-3 + 0.25
         assert rates[0] == pytest.approx((0.1 * stiffness - 5.0) / moment, rel=1e-6)
+
+
+def test_controls_of_bodies():
+    """Torques and wrenches of controls accelerate by Newton's and Euler's laws; angles of controls are followed."""
+    scene = two_bodies()
+    model, integrator, state = build(scene)
+    for _ in range(10):
+        state = integrator.step(state, 0.01, ddg.Controls(torques=[0.01]))
+    assert state.body("b").angular_velocity[2] == pytest.approx(0.01 * 0.1 / 2e-3, rel=1e-9)
+    scene = ddg.Scene(gravity=(0, 0, 0))
+    scene.add_body(mass=2.0, inertia=(1e-2,) * 3, center=(0, 0, 0))
+    model, integrator, state = build(scene)
+    for _ in range(10):
+        state = integrator.step(state, 0.01, ddg.Controls(wrenches=[[1.0, 0, 0, 0, 2e-3, 0]]))
+    assert state.body(0).velocity == pytest.approx([0.05, 0, 0], rel=1e-9)
+    assert state.body(0).angular_velocity == pytest.approx([0, 0.02, 0], rel=1e-9)
+    state = integrator.step(state, 0.01)  # without controls nothing acts
+    assert state.body(0).velocity == pytest.approx([0.05, 0, 0], rel=1e-9)
+    scene = ddg.Scene()
+    arm = scene.add_body(ddg.Box((0.1, 0, 0), (0.1, 0.01, 0.01)), density=1000.0)
+    scene.hinge(arm, point=(0, 0, 0), axis=(0, 1, 0), angle=0.0)
+    _model, integrator, state = build(scene)
+    for k in range(50):
+        state = integrator.step(state, 0.01, ddg.Controls(angles=[0.02 * k]))
+    turned = state.body(arm).rotation
+    assert np.arctan2(turned[0, 2], turned[0, 0]) == pytest.approx(0.98, abs=1e-4)
+
+
+def test_wrenches_on_a_pinned_body():
+    """A force at the centre of a pinned body, l from the pin, has the moment l x f; in equilibrium it balances a spring hinge."""
+    scene = ddg.Scene(gravity=(0, 0, 0))
+    body = scene.add_body(mass=2.0, inertia=(1e-2,) * 3, center=(0.5, 0, 0))
+    scene.hinge(body, point=(0, 0, 0), axis=(0, 1, 0))
+    model, integrator, state = build(scene)
+    for _ in range(10):
+        state = integrator.step(state, 1e-3, ddg.Controls(wrenches=[[0, 0, 1.0, 0, 0, 0]]))
+    assert state.body(body).angular_velocity[1] == pytest.approx(-0.5 * 0.01 / (1e-2 + 2.0 * 0.25), rel=1e-6)
+    wire = scene.add_rod(
+        [(0.5, 0, 0), (0.5, 0, -1)], section=ddg.Stiffness(EA=100.0, EI1=0.0, mass_per_length=1.0), bend=False
+    )
+    scene.fix(wire, [-1])
+    scene.attach(wire, [0], body, frame=False)
+    model = scene.build(device=DEVICE)
+    state = ddg.statics.solve(model, controls=ddg.Controls(wrenches=[[0, 0, 1e-3, 0, 0, 0]]))
+    assert state.body(body).position[2] == pytest.approx(1e-5, rel=1e-3)
+
+
+def test_worlds_of_bodies_are_independent():
+    """Every world follows its own torque, as alone; a state survives a snapshot bit by bit."""
+    model = two_bodies().build(device=DEVICE, worlds=3)
+    integrator, state, torques = ddg.Integrator(model), model.state(), np.array([[0.0], [0.01], [-0.02]])
+    for _ in range(10):
+        state = integrator.step(state, 0.01, ddg.Controls(torques=torques))
+    assert state.body("b").angular_velocity[:, 2] == pytest.approx(torques[:, 0] * 0.1 / 2e-3, rel=1e-9, abs=1e-12)
+    after = integrator.step(state, 0.01).snapshot()
+    again = ddg.Integrator(model).step(model.restore(state.snapshot()), 0.01).snapshot()
+    assert all(np.array_equal(after[name], again[name]) for name in after)

@@ -36,6 +36,10 @@ class Controls:
         field: (3,) or (worlds, 3) [T], a uniform magnetic field on top of the scene's.
         fields: values that replace the fields of the scene, by name; see `Scene.prescribe`. One number, one number an element, or both
             with an axis of worlds in front; (worlds,) is one number a world.
+        angles: of hinges (hinges,) or (worlds, hinges) [rad], in the order of `Scene.hinge` calls, instead of the scene's; hinges
+            without a driven angle ignore theirs, which is zero.
+        torques: of hinges (hinges,) or (worlds, hinges) [N m], added to the scene's.
+        wrenches: force at the centre of mass [N] and moment [N m] on every rigid body (bodies, 6) or (worlds, bodies, 6), in space.
     """
 
     poses: Numbers | None = None
@@ -44,6 +48,9 @@ class Controls:
     gravity: Numbers | None = None
     field: Numbers | None = None
     fields: Mapping[str, Numbers] | None = None
+    angles: Numbers | None = None
+    torques: Numbers | None = None
+    wrenches: Numbers | None = None
 
     def checked(self, model: "Model") -> dict[str, Floats]:
         """Return the given inputs by name, each with an axis of worlds (1 or worlds, ...); "fields" is a dict.
@@ -99,7 +106,7 @@ def checked(controls: Controls | None, model, call: str = "step") -> dict[str, n
     if not isinstance(controls, Controls):
         raise SceneError(
             f"{call}: controls are {argument_checks.shown(controls)}; give "
-            "Controls(poses=..., forces=..., moments=..., gravity=..., field=..., fields=...)"
+            "Controls(poses=..., forces=..., moments=..., gravity=..., field=..., fields=..., angles=..., torques=..., wrenches=...)"
         )
     return controls.checked(model)
 
@@ -121,7 +128,12 @@ def _numbers(name: str, values, shape: tuple, worlds: int) -> np.ndarray:
 def shapes(model) -> dict[str, tuple]:
     """Return the shape of every field of `Controls` for one world, by name."""
     points, edges, grips = model.points_count, model.order.edges_count, len(model.grips)
-    return {"forces": (points, 3), "moments": (edges,), "gravity": (3,), "field": (3,), "poses": (grips, 6)}
+    hinges, bodies = len(model.drives.joints), len(model.scene.bodies)
+    of_bodies = {"angles": (hinges,), "torques": (hinges,), "wrenches": (bodies, 6)}
+    return of_bodies | {"forces": (points, 3), "moments": (edges,), "gravity": (3,), "field": (3,), "poses": (grips, 6)}
+
+
+DRIVES = "angles", "torques"  # controls of hinges
 
 
 def require_acting(model, names) -> None:
@@ -138,7 +150,8 @@ def require_acting(model, names) -> None:
     pinned = [joint.second for joint in model.scene.body_joints if joint.first < 0]
     if "gravity" in names and pinned:
         raise SceneError(
-            f"Controls: gravity: body {pinned[0]} is joined to the world, and its weight is that of the scene's gravity; leave gravity out"
+            f"Controls: gravity: body {pinned[0]} is joined to the world, and its weight is that of the scene's gravity; leave gravity "
+            "out"
         )
     if "poses" in names and not model.grips:
         raise SceneError(
@@ -147,8 +160,18 @@ def require_acting(model, names) -> None:
 
 
 def _refuse_missing(model, inputs: dict[str, np.ndarray]) -> None:
-    """Refuse fields that act on nothing, and moments about edges without a twist angle."""
+    """Refuse controls that act on nothing, and moments about edges without a twist angle."""
     require_acting(model, inputs)
+    for name in DRIVES:
+        if name in inputs and not model.drives.joints:
+            raise SceneError(f"Controls: {name} of no hinge; add one by scene.hinge(...)")
+    if "angles" in inputs:
+        for hinge in np.flatnonzero(~model.drives.driven & inputs["angles"].any(0))[:1]:
+            raise SceneError(
+                f"Controls: angles: hinge {hinge} has no driven angle; give 0, or add it by scene.hinge(..., angle=0.0)"
+            )
+    if "wrenches" in inputs and not model.scene.bodies:
+        raise SceneError("Controls: wrenches of no rigid body; add one by scene.add_body(...)")
     if "moments" in inputs:
         untwisted = np.flatnonzero(inputs["moments"].any(0) & ~model.order.twisted)
         if untwisted.size:

@@ -22,6 +22,7 @@ from ddg_warp.kernels.elements.rod_layout import rod_storage
 from ddg_warp.kernels.stepping import rod_step
 from ddg_warp.model import rod_shell_coupling
 from ddg_warp.model.fields import Fields
+from ddg_warp.model.joint_drives import JointDrives
 from ddg_warp.model.parameters import valid_numbers
 from ddg_warp.model.rebuild import ModelBuilder
 from ddg_warp.model.rod_group import RodGroup
@@ -57,6 +58,7 @@ class Model:
         worlds: number of independent copies.
         allow_rounding: whether steps and solves run although float32 rounding exceeds its limit.
         order: points and edges in the user's order.
+        drives: hinges of rigid bodies, and what drives them.
         fields: rest strains of rods that the scene prescribes, see `Scene.prescribe`.
     """
 
@@ -89,7 +91,7 @@ class Model:
         ]
         self.coupled = self._build_coupled() if needs_coupling(scene) else None
         self.order = UserNumbering(self)
-        self.fields = Fields(self)
+        self.fields, self.drives = Fields(self), JointDrives(self)
 
     def _build_coupled(self):
         from ddg_warp.compile.coupled.builder import compile_coupled

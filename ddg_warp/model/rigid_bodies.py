@@ -8,8 +8,6 @@ import warp as wp
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.rigid_bodies import motion
 
-REST, TORQUE = "rest_6", "torque"  # driven parameters of the term "hinge": angle and torque
-
 
 class RigidBodyTables:
     """Constant arrays of the rigid bodies of a `CoupledModel`.
@@ -17,6 +15,7 @@ class RigidBodyTables:
     Attributes:
         `host`: `RigidBodyArrays`.
         `origins`, `spins`, `carried`, `owner`, `starts`, `arms`: see there.
+        center: carried node that is the centre of mass (B,), -1 for the origin.
         moments: principal moments of inertia (W B,).
     """
 
@@ -28,12 +27,12 @@ class RigidBodyTables:
 
         for name in ("origins", "spins", "carried", "owner", "starts"):
             setattr(self, name, put(getattr(host, name)))
+        place = np.full(coupled.blocks, -1)
+        place[host.carried] = np.arange(len(host.carried))
+        self.center = put(place[host.centers])
         self.matrix = wp.types.matrix((3, 3), coupled.real)
         self.arms = wp.array(host.arms.reshape(-1, 3), dtype=coupled.vector, device=device)
         self.moments = wp.array(np.tile(host.moments, (coupled.worlds, 1)), dtype=coupled.vector, device=device)
-        for part in coupled.sets:
-            for name in (REST, TORQUE) if part.term.name == "hinge" else ():
-                part.parameters.prescribe(name, (coupled.worlds, part.elements))
         self._carry = motion.carry_kernel(coupled.real)
 
     def __len__(self) -> int:

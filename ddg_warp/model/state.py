@@ -365,3 +365,4 @@ def query(call: str, model, state) -> None:
     """Refuse an argument that is no state of the model, and set the fields of the model to the time of the state."""
     check_state(call, model, state)
     model.fields.to(state.time)
+    model.drives.to(state.time, 1.0 if state.outcome is None else state.time)

@@ -65,8 +65,8 @@ class BodyJoint:
         call: "ball", "hinge" or "weld".
         first, second: bodies, -1 for the world.
         point: common point at rest (3,) [m]; axis: unit vector (3,) of a hinge at rest.
-        angle: of `second` relative to `first` about the axis, a function of time [rad]; None if free.
-        torque: on `second` about the axis, a function of time [N m]; None without.
+        angle: of `second` relative to `first` about the axis [rad], one number or a function of time; None if free.
+        torque: on `second` about the axis [N m], one number or a function of time; None without.
         damping: [N m s]; stops: least and largest angle [rad], None without.
         stiffness: of the separation [N/m], None for the default.
         name: "" without.
@@ -77,8 +77,8 @@ class BodyJoint:
     second: int
     point: np.ndarray
     axis: np.ndarray
-    angle: Callable[[float], float] | None
-    torque: Callable[[float], float] | None
+    angle: float | Callable[[float], float] | None
+    torque: float | Callable[[float], float] | None
     damping: float
     stops: tuple[float, float] | None
     stiffness: float | None
@@ -179,7 +179,7 @@ class RigidBodies:
         *,
         point,
         axis,
-        angle: Callable[[float], float] | None = None,
+        angle: float | Callable[[float], float] | None = None,
         torque: float | Callable[[float], float] | None = None,
         damping: float = 0.0,
         stops: tuple[float, float] | None = None,
@@ -195,7 +195,7 @@ class RigidBodies:
             first, second: bodies; without `second` the world.
             point: common point at rest (3,) [m].
             axis: direction at rest (3,).
-            angle: driven angle, a function of time [rad].
+            angle: driven angle, one number or a function of time [rad]; `Controls.angles` replaces it step by step.
             torque: on `second` about the axis, and the opposite one on `first`: one number, or a function of time [N m].
             damping: torque against the angular rate [N m s].
             stops: least and largest angle [rad].
@@ -207,9 +207,6 @@ class RigidBodies:
         """
         if angle is not None and (torque is not None or damping or stops is not None):
             raise SceneError("hinge: a driven angle leaves nothing to a torque, damping or stops; leave these out")
-        if torque is not None and not callable(torque):
-            value = argument_checks.number("hinge: torque", torque)
-            torque = _Constant(value)
         argument_checks.number("hinge: damping", damping, "zero or more [N m s]", lambda v: v >= 0.0)
         if stops is not None:
             lower, upper = argument_checks.broadcast("hinge: stops", stops, (2,))
@@ -218,9 +215,11 @@ class RigidBodies:
                     f"hinge: stops are ({lower:g}, {upper:g}) rad; give the least and the largest, with 0 between them"
                 )
             stops = float(lower), float(upper)
-        for label, function in (("angle", angle), ("torque", torque)):
-            if function is not None:
-                argument_checks.amplitude(f"hinge: {label}", function)
+        for label, value in (("angle", angle), ("torque", torque)):
+            if callable(value):
+                argument_checks.value_at(f"hinge: {label}", value, 0.0, error=SceneError)
+            elif value is not None:
+                argument_checks.number(f"hinge: {label}", value)
         options = {"angle": angle, "torque": torque, "damping": float(damping), "stops": stops}
         return self._add_joint("hinge", first, second, point, axis, stiffness=stiffness, name=name, **options)
 
@@ -275,16 +274,6 @@ class RigidBodies:
         if not 0 <= index < len(self.bodies):
             raise SceneError(f"{call}: body {index} does not exist; the scene has {len(self.bodies)} bodies so far")
         return index
-
-
-@dataclass(frozen=True)
-class _Constant:
-    """Constant function of time, which pickles."""
-
-    value: float
-
-    def __call__(self, t: float) -> float:
-        return self.value
 
 
 def _tensor(inertia) -> np.ndarray:

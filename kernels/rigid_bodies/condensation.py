@@ -18,9 +18,11 @@ from ddg_warp.kernels.core.inertia import mass_type
 from ddg_warp.kernels.core.islands import ENERGY_BUFFER, INERTIA_COEFFICIENT, LOAD_SCALE, NEEDS_DIRECTION, STATUS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.linear.sliced_ell import inertia_function, product_functions
+from ddg_warp.kernels.measures.joint_curvature_twist import rotations
 from ddg_warp.kernels.residual.coupled_residual import (
     elements_function,
     inputs_type,
+    largest_function,
     meeting_type,
     residual_functions,
     results_type,
@@ -34,7 +36,8 @@ def bodies_type(real):
     """Return the struct of rigid bodies, for kernels of solves.
 
     `origins`, `spins`, `carried`, `owner`, `starts`: see `ddg_warp.compile.coupled.rigid_bodies`. `y`, `derivative`: y and D of
-    carried nodes (W C,). `inertia`: gamma P I P^T (W B,).
+    carried nodes (W C,). `inertia`: gamma P I P^T (W B,). `force`, `moment`: of controls, at the centre of mass (W B,). `center`: carried
+    node that is the centre of mass, -1 for the origin (B,).
     """
     V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
 
@@ -47,6 +50,9 @@ def bodies_type(real):
         y: wp.array(dtype=V)
         derivative: wp.array(dtype=M)
         inertia: wp.array(dtype=M)
+        force: wp.array(dtype=V)
+        moment: wp.array(dtype=V)
+        center: wp.array(dtype=int)
 
     return Bodies
 
@@ -57,9 +63,10 @@ def balance_kernel(real, linear, quadratic: bool, contact: bool):
 
     Carried nodes have no residual of their own; their energy changes stay with them.
     """
-    Meeting, Bodies = meeting_type(real, linear), bodies_type(real)
+    V, Meeting, Bodies = wp.types.vector(3, real), meeting_type(real, linear), bodies_type(real)
     Given, Found, H = inputs_type(real, quadratic), results_type(real, linear), wp.types.vector(3, linear)
     (outer, settle), add = residual_functions(real, linear, quadratic, contact), elements_function(real, linear)
+    largest, (_, transposed, *_) = largest_function(real), rotations(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def balance(
@@ -85,13 +92,24 @@ def balance_kernel(real, linear, quadratic: bool, contact: bool):
         moment, moment_size, moment_stiff, work, moment_rounding = add(
             sets, s, w, accepted, moment, moment_size, moment_stiff, work, wp.abs(work)
         )
-        K = bodies.inertia[b + w * bodies.origins.shape[0]]
+        body = b + w * bodies.origins.shape[0]
+        K = bodies.inertia[body]
         turn = inputs.q[spin]
         u = turn - inputs.base[spin]
         inertial = K * turn
         work += wp.dot(u, inertial - K * u * real(0.5))
         moment -= inertial
         moment_stiff += wp.max(wp.get_diag(K))
+        pushed = V(bodies.force[body])
+        turned = V(bodies.moment[body])
+        if bodies.center[b] >= 0:
+            turned += wp.cross(bodies.y[bodies.center[b] + carried], pushed)
+        force += pushed
+        size += largest(pushed)
+        change -= wp.dot(pushed, inputs.q[center] - inputs.base[center])
+        moment += transposed(turn, turned)
+        moment_size += largest(turned)
+        work -= wp.dot(turned, u)
         for j in range(bodies.starts[b], bodies.starts[b + 1]):
             k_j = bodies.carried[j]
             i = k_j + offset

@@ -254,6 +254,10 @@ class CoupledTangent(TangentBlock):
 
     def give(self, inputs: dict[str, np.ndarray]) -> None:
         super().give(inputs)
+        if "wrenches" in inputs:
+            rigid, given = self.host.rigid_bodies, self.given.reshape(self.worlds, -1, 3)
+            given[:, rigid.centers] += inputs["wrenches"][..., :3]
+            given[:, rigid.spins] += inputs["wrenches"][..., 3:]
         self.given_field[:] = inputs.get("field", 0.0)
 
     def prescribe(self, state, load_factor: float) -> None:

@@ -191,7 +191,7 @@ class Equilibrium:
         self.iterations = 0
         self.outcome, self.stiffness = "", None
         self.reached = 0.0, 0.0, 1.0  # start, current and final load parameter of `load`
-        self._fields = _fields_between(model, {}, 0.0, 1.0)
+        self._fields, self._hinges = _fields_between(model, {}, 0.0, 1.0), _hinges_between({}, 0.0, 1.0)
 
     @property
     def pcg_iterations(self) -> int:
@@ -258,6 +258,7 @@ class Equilibrium:
         state = state.copy()
         state.stop()
         self._fields = _fields_between(self.model, inputs.get("fields", {}), start, end)
+        self._hinges = _hinges_between(inputs, start, end)
         shapes = RestPath(self.model, rest if rest is not None else {})
         if self.coupled and self.coupled.arcs:
             load_steps = self.coupled.arcs.increments(state, inputs.get("poses"), start, end, load_steps)
@@ -277,6 +278,7 @@ class Equilibrium:
         if self._has_friction:
             self.coupled.wary = True
         self.model.fields.to(start, self._fields(start))
+        self.model.drives.to(start, start, self._hinges(start))
         balanced = self._has_friction or self._balanced(state, start)
         while current != end:
             increment = whole * 0.5**cuts
@@ -365,6 +367,7 @@ class Equilibrium:
         """
         tangent, self.stiffness = self.tangent, None
         self.model.fields.to(load_factor, self._fields(load_factor))
+        self.model.drives.to(load_factor, load_factor, self._hinges(load_factor))
         if not tangent.free.any():
             begun, state = state, state.copy()
             tangent.move_supports(state, before, load_factor)
@@ -522,6 +525,17 @@ class Equilibrium:
         overturned = tangent.turned_over(q, tangent.dofs(alone))
         better = overturned or not potential(alone) <= potential(follow)
         return follow if better and np.isfinite(potential(follow)) else alone
+
+
+def _hinges_between(inputs: Mapping, start: float, end: float) -> Callable[[float], dict]:
+    """Return the drives of hinges in controls as a function of the load parameter; angles are reached at its `end`."""
+
+    def at(load_factor: float) -> dict:
+        part = (load_factor - start) / (end - start) if end != start else 1.0
+        scales = {"angles": part, "torques": 1.0}
+        return {name: scale * inputs[name] for name, scale in scales.items() if name in inputs}
+
+    return at
 
 
 def _fields_between(model, ends: Mapping, start: float, end: float) -> Callable[[float], dict]:

@@ -97,7 +97,7 @@ class CoupledStep(StepDriver):
         self.forces = forces_of(model, self.coupled, self.midpoint, loads)
         if solver.user_forces:
             self.forces.append(solver.user_forces)
-        self.bodies = RigidBodyStep(model, solver, self.midpoint) if solver.rigid_bodies else None
+        self.bodies = RigidBodyStep(solver, self.midpoint) if solver.rigid_bodies else None
         self.energy = CoupledEnergy(self, counts_of and counts_of.energy) if integrator.energy_bound else None
         self.arcs = self._resolve_arcs()
         self.field = CoupledField(model, self.midpoint, integrator.field)
@@ -178,8 +178,6 @@ class CoupledStep(StepDriver):
     def prescribe(self, t0: float, t1: float) -> None:
         """Upload supports, loads, magnetic field and flow between t0 and t1."""
         super().prescribe(t0, t1)
-        if self.bodies:
-            self.bodies.drives.upload(t0, t1)
         if self.decoupled:
             self.decoupled.prescribe(t0, t1)
         if self.arcs:

@@ -13,7 +13,7 @@ from ddg_warp.compile.precision import lost_in_rounding
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core import outcome
 from ddg_warp.model import validate
-from ddg_warp.model.controls import Controls, TimedControls, checked, controls_at
+from ddg_warp.model.controls import DRIVES, Controls, TimedControls, checked, controls_at
 from ddg_warp.model.model import Model, check_model
 from ddg_warp.model.state import State, check_state
 from ddg_warp.solve.forces.control_loads import LOADS, Given
@@ -141,6 +141,7 @@ class Integrator:
             self._buffers = [StateBuffer(model), StateBuffer(model)]
         self._graphs = Graphs(model, self._load_modules)
         self.given_fields: dict[str, np.ndarray] = {}  # values of fields in the controls of a step
+        self.given_drives: dict[str, np.ndarray] = {}  # angles and torques of hinges in these controls
         self._steps_since_check = 0
         self._dt = wp.zeros(model.worlds, dtype=model.types.real, device=model.wp_device)
         self._dt_host = None
@@ -259,6 +260,7 @@ class Integrator:
     def advance(self, source: int, start: float, dt: float, anew: bool = False) -> None:
         """Step from one buffer at the time `start` to the other; `anew` for an outside state: see `forget`."""
         self.model.fields.to(self.evaluation_time(start, dt), self.given_fields)
+        self.model.drives.to(self.evaluation_time(start, dt), 1.0, self.given_drives)
         for part in self._parts:
             part.prescribe(start, start + dt)
 
@@ -387,11 +389,14 @@ class Integrator:
     def _control(self, inputs: dict[str, np.ndarray], source: int) -> None:
         """Upload the controls of a step from a buffer; rebuild the steppers with the first control load."""
         self.given_fields = inputs.get("fields", {})
+        self.given_drives = {name: inputs[name] for name in DRIVES if name in inputs}
         if self.given is None and any(name in inputs for name in LOADS):
             self.given = Given(self.model)
             self._remake()
         if self.given is not None:
             self.given.upload(inputs)
+        if self._coupled is not None and self._coupled.bodies:
+            self._coupled.bodies.push(inputs.get("wrenches"))
         if self.model.magnetic:
             field = np.broadcast_to(inputs.get("field", 0.0), (self.model.worlds, 3))
             self.field.assign(np.ascontiguousarray(field.T))

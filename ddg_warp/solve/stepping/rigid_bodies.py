@@ -1,9 +1,9 @@
 """Rigid bodies in time steps of the coupled system: flight before a solve, poses and momenta after it."""
 
+import numpy as np
 import warp as wp
 
 from ddg_warp.kernels.rigid_bodies import motion
-from ddg_warp.solve.stepping.joint_drives import JointDrives
 
 
 class RigidBodyStep:
@@ -11,14 +11,11 @@ class RigidBodyStep:
 
     Args:
         newton: `CoupledNewton`, with its `RigidBodies`.
-
-    Attributes:
-        drives: angles and torques of hinges.
     """
 
-    def __init__(self, model, newton, midpoint: bool):
-        self.drives = JointDrives(model, midpoint)
+    def __init__(self, newton, midpoint: bool):
         self.newton, self.bodies, self.tables = newton, newton.rigid_bodies, newton.rigid_bodies.tables
+        self._pushed = False  # True with wrenches of controls
         self.coupled, real = newton.coupled, newton.coupled.real
         self._predict, self._turn = motion.predict_kernel(real, midpoint), motion.turn_kernel(real)
         self._finish, self._depart = motion.finish_kernel(real, midpoint), motion.depart_kernel(real)
@@ -28,6 +25,17 @@ class RigidBodyStep:
         """Kernels to load before a capture."""
         departs = [self._depart] if self.newton.contact else []
         return [self._predict, self._turn, self._finish, *departs, *self.tables.kernels]
+
+    def push(self, wrenches: np.ndarray | None) -> None:
+        """Set forces at the centres and moments on all bodies (1 or worlds, bodies, 6), none without."""
+        if wrenches is None and not self._pushed:
+            return
+        self._pushed = wrenches is not None
+        shape = self.coupled.worlds, len(self.tables), 6
+        values = np.broadcast_to(0.0 if wrenches is None else wrenches, shape).reshape(-1, 6)
+        struct = self.bodies.bodies
+        struct.force.assign(np.ascontiguousarray(values[:, :3]))
+        struct.moment.assign(np.ascontiguousarray(values[:, 3:]))
 
     def predict(self, before) -> None:
         """Find the orientations after the flight, and place carried nodes there."""

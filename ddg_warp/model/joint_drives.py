@@ -1,0 +1,63 @@
+"""Angles and torques of hinges, of the scene and of `Controls`, in the parameters of their elements."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ddg_warp import argument_checks
+
+REST, TORQUE = "rest_6", "torque"  # driven parameters of the term "hinge": angle and torque
+
+
+class JointDrives:
+    """Hinges of a model, and the values that drive them.
+
+    Attributes:
+        joints: the hinges, `BodyJoint`, in the order of `Controls.angles`.
+        driven: mask of hinges with a driven angle (hinges,).
+    """
+
+    def __init__(self, model):
+        self.joints = [joint for joint in model.scene.body_joints if joint.call == "hinge"]
+        self.driven = np.array([joint.angle is not None for joint in self.joints], bool)
+        self._worlds, self._tables = model.worlds, []
+        numbers = [i for i, joint in enumerate(model.scene.body_joints) if joint.call == "hinge"]
+        for part in model.coupled.sets if numbers else ():
+            if part.term.name == "hinge":
+                element = {number: k for k, number in enumerate(part.host.owner[0].tolist())}
+                index = np.array([element[number] for number in numbers])
+                for name in (REST, TORQUE):
+                    part.parameters.prescribe(name, (model.worlds, part.elements))
+                self._tables.append((part.parameters, index + part.elements * np.arange(model.worlds)[:, None]))
+
+    def to(self, t: float, factor: float = 1.0, controls: Mapping | None = None) -> None:
+        """Write the values at a time, or at a load parameter `factor` of statics, which scales constant torques.
+
+        Args:
+            controls: "angles" and "torques" (1 or worlds, hinges) of `Controls`.
+
+        Raises:
+            SolverError: a function failed, or its value does not fit; the message names the hinge.
+        """
+        if not self.joints:
+            return
+        controls = controls or {}
+        angles, torques = (
+            np.array([_value(k, joint, label, t, factor) for k, joint in enumerate(self.joints)])
+            for label in ("angle", "torque")
+        )
+        angles = controls.get("angles", angles)
+        torques = torques + factor * controls.get("torques", 0.0)
+        for table, index in self._tables:
+            table.write(REST, [(index, np.broadcast_to(np.where(self.driven, angles, 0.0), index.shape))])
+            table.write(TORQUE, [(index, np.broadcast_to(torques, index.shape))])
+
+
+def _value(number: int, joint, label: str, t: float, factor: float) -> float:
+    """Return the angle or the torque of a hinge, zero without."""
+    given = getattr(joint, label)
+    if given is None:
+        return 0.0
+    if not callable(given):
+        return given if label == "angle" else factor * given
+    return float(argument_checks.value_at(f"hinge {joint.name or number}: {label}", given, t))
