@@ -11,6 +11,7 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp import stability
+from ddg_warp.io.hdf5 import TrajectoryReader
 
 GRAVITY = 9.81  # m/s^2
 # Rod of the references: radius, length [m], Young's modulus [Pa], Poisson's ratio; of vanishing density
@@ -28,7 +29,7 @@ def _build_there(device, monkeypatch):
 
 def build(scene, **options):
     """Return model, integrator and start."""
-    model = scene.build(device=DEVICE)
+    model = scene.build(device=DEVICE, precision="float64")
     return model, ddg.Integrator(model, **options), model.state()
 
 
@@ -60,7 +61,7 @@ def test_free_asymmetric_top_flips_at_its_period(device):
     for dt in (0.1, 0.05):
         scene = ddg.Scene(gravity=(0, 0, 0))
         body = scene.add_body(mass=1.0, inertia=moments, center=(0, 0, 0), angular_velocity=rates)
-        model = scene.build(device=device)
+        model = scene.build(device=device, precision="float64")
         integrator, state, middle, energy = ddg.Integrator(model), model.state(), [], []
         start = state.coupled.momentum.numpy()[0]
         for _ in range(int(75.0 / dt)):
@@ -376,7 +377,7 @@ def test_spectra_of_bodies_on_rods():
     rod = reference_rod(scene)
     for end, x in ((0, 0.0), (-1, LENGTH)):
         scene.attach(rod, [end], scene.add_body(ddg.Box((x, 0, 0), (0.01,) * 3), mass=0.02))
-    model = scene.build(device=DEVICE)
+    model = scene.build(device=DEVICE, precision="float64")
     rates = stability.spectrum(model, model.state(), count=12).frequencies
     assert np.nan_to_num(rates[:6]) == pytest.approx(np.zeros(6), abs=1e-4)
     assert rates[6] == pytest.approx(25.06628, rel=2e-3)
@@ -412,7 +413,7 @@ def test_stability_of_a_pinned_body():
             )
             scene.fix(spring, [0])
             scene.attach(spring, [-1], body, frame=False)
-        model = scene.build(device=DEVICE)
+        model = scene.build(device=DEVICE, precision="float64")
         rates = stability.spectrum(model, model.state(), count=1, load=1.0).eigenvalues
         assert (rates[0] > 0.0) == stands
         moment = 1e-3 + 0.25
@@ -422,13 +423,13 @@ def test_stability_of_a_pinned_body():
 def test_controls_of_bodies():
     """Torques and wrenches of controls accelerate by Newton's and Euler's laws; angles of controls are followed."""
     scene = two_bodies()
-    model, integrator, state = build(scene)
+    _model, integrator, state = build(scene)
     for _ in range(10):
         state = integrator.step(state, 0.01, ddg.Controls(torques=[0.01]))
     assert state.body("b").angular_velocity[2] == pytest.approx(0.01 * 0.1 / 2e-3, rel=1e-9)
     scene = ddg.Scene(gravity=(0, 0, 0))
     scene.add_body(mass=2.0, inertia=(1e-2,) * 3, center=(0, 0, 0))
-    model, integrator, state = build(scene)
+    _model, integrator, state = build(scene)
     for _ in range(10):
         state = integrator.step(state, 0.01, ddg.Controls(wrenches=[[1.0, 0, 0, 0, 2e-3, 0]]))
     assert state.body(0).velocity == pytest.approx([0.05, 0, 0], rel=1e-9)
@@ -459,14 +460,14 @@ def test_wrenches_on_a_pinned_body():
     )
     scene.fix(wire, [-1])
     scene.attach(wire, [0], body, frame=False)
-    model = scene.build(device=DEVICE)
+    model = scene.build(device=DEVICE, precision="float64")
     state = ddg.statics.solve(model, controls=ddg.Controls(wrenches=[[0, 0, 1e-3, 0, 0, 0]]))
     assert state.body(body).position[2] == pytest.approx(1e-5, rel=1e-3)
 
 
 def test_worlds_of_bodies_are_independent():
     """Every world follows its own torque, as alone; a state survives a snapshot bit by bit."""
-    model = two_bodies().build(device=DEVICE, worlds=3)
+    model = two_bodies().build(device=DEVICE, precision="float64", worlds=3)
     integrator, state, torques = ddg.Integrator(model), model.state(), np.array([[0.0], [0.01], [-0.02]])
     for _ in range(10):
         state = integrator.step(state, 0.01, ddg.Controls(torques=torques))
@@ -474,3 +475,21 @@ def test_worlds_of_bodies_are_independent():
     after = integrator.step(state, 0.01).snapshot()
     again = ddg.Integrator(model).step(model.restore(state.snapshot()), 0.01).snapshot()
     assert all(np.array_equal(after[name], again[name]) for name in after)
+
+
+def test_recorded_poses(tmp_path):
+    """A recording holds the poses of bodies, and the surfaces of their shapes as those of moving obstacles."""
+    model, integrator, state = build(cube_on_cantilever(2e-3))
+    states = []
+    with ddg.Recorder(model, tmp_path / "run") as recorder:
+        for _ in range(3):
+            state = integrator.step(state, 0.02)
+            recorder.record(state)
+            states.append(state)
+    with TrajectoryReader(tmp_path / "run" / "trajectory.h5") as reader:
+        for frame, state in enumerate(states):
+            pose = state.body("cube")
+            assert np.array_equal(reader.body_poses[frame][0, :, 3], pose.position)
+            assert np.array_equal(reader.body_poses[frame][0, :, :3], pose.rotation)
+            corners = reader.obstacle_points[frame]
+            assert np.linalg.norm(corners - pose.position, axis=1) == pytest.approx(0.01 * np.sqrt(3.0), rel=1e-6)

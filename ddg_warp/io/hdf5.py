@@ -4,7 +4,8 @@
                   series/NAME (F,); with several worlds (F, B, P, 3) and (F, B, E, 3);
                   at_points/NAME (F, B P) and at_cells/NAME (F, B (R + T)) if wanted: fields of all worlds, cells are the rods
                   (without values), then the triangles; obstacle_points (F, M, 3) or (F, B, M, 3) [m], nodes of moving
-                  obstacles; contacts/{world, objects, point, gap, force, friction} (n, ...) if wanted, pairs of all frames
+                  obstacles and of shapes of rigid bodies; body_poses (F, N, 3, 4) or (F, B, N, 3, 4), see
+                  `State.body_poses`; contacts/{world, objects, point, gap, force, friction} (n, ...) if wanted, pairs of all frames
                   one after the other, up to contacts/ends[f] for frame f
     /model        curves/{counts, closed, radius, names, batch}, surfaces/{triangles, first, names, thickness} if there are
                   any, obstacles/{...}, see `Obstacles`, touching/{names, size, force}, see `ContactScales`, parameters/NAME,
@@ -111,6 +112,7 @@ class TrajectoryWriter:
     ):
         names = ["points"] + ["velocities"] * velocities + ["directors"] * directors
         names += ["obstacle_points"] * (model.obstacles is not None and bool(model.obstacles.moved.any()))
+        names += ["body_poses"] * bool(model.bodies)
         names += [f"at_points/{name}" for name in at_points] + [f"at_cells/{name}" for name in at_cells]
         self._prepare(path, model, block, names, contacts)
         partial = self.path.with_name(self.path.name + ".partial")
@@ -276,6 +278,9 @@ class TrajectoryWriter:
             return (worlds * of_a_world,)
         if name == "obstacle_points":
             rows = int(np.count_nonzero(self._model.obstacles.moving))
+        if name == "body_poses":
+            shape = len(self._model.bodies), 3, 4
+            return shape if worlds == 1 else (worlds, *shape)
         if name == "directors":
             rows = int(np.sum(curves.counts)) - np.count_nonzero(~np.asarray(curves.closed))
         return (rows, 3) if worlds == 1 else (worlds, rows, 3)

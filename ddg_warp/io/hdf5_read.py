@@ -25,7 +25,7 @@ from ddg_warp.typing import Array, Bools, FilePath, Floats, Integers
 CURVE_FIELDS = ("counts", "closed", "radius", "names", "batch")
 SURFACE_FIELDS = ("triangles", "first", "names", "thickness")
 COUNTS = "run"  # group of a checkpoint: counts of the run up to the frame
-FRAMES = ("points", "velocities", "directors", "obstacle_points")
+FRAMES = ("points", "velocities", "directors", "obstacle_points", "body_poses")
 
 
 RATIO = 1024  # largest size of a dataset over the size of its file; only fill values compress better
@@ -229,6 +229,7 @@ class TrajectoryReader:
         surfaces: Triangles among the points, or None.
         obstacles: Obstacles as surfaces, or None.
         obstacle_points: Nodes of moving obstacles [m], shape (F, M, 3) or (F, B, M, 3), read when indexed, or None.
+        body_poses: Poses of rigid bodies, see `State.body_poses`, shape (F, N, 3, 4) or (F, B, N, 3, 4), read when indexed, or None.
         contacts: `Contacts` of each frame, read when indexed by a number, or None if not recorded.
         contact_scales: Names and typical scales of contact, or None.
         parameters: The model's parameters by name.
@@ -272,6 +273,7 @@ class TrajectoryReader:
         if "surfaces" in model:
             self.surfaces = Surfaces(**{name: _array(model["surfaces"][name]) for name in SURFACE_FIELDS})
         self.obstacles, self.obstacle_points = None, fields.get("obstacle_points")
+        self.body_poses = fields.get("body_poses")
         if "obstacles" in model:
             self.obstacles = Obstacles(
                 **{field.name: _array(model["obstacles"][field.name]) for field in fields_of(Obstacles)}

@@ -151,6 +151,11 @@ class Model:
         return self.order.obstacles
 
     @property
+    def bodies(self) -> list[str]:
+        """Names of the rigid bodies, in their order."""
+        return [body.name for body in self.scene.bodies]
+
+    @property
     def contact_scales(self) -> ContactScales | None:
         """Contact metadata of recordings: labels, sizes, force scale; None without contact."""
         host = self.coupled.host.contact_parameters if self.coupled is not None else None

@@ -305,8 +305,13 @@ class State:
         Args:
             item: name, index or handle of the body.
         """
-        names = [body.name for body in self.model.scene.bodies]
-        return body_state(self, named(BODY, item, names))
+        return body_state(self, named(BODY, item, self.model.bodies))
+
+    def body_poses(self) -> np.ndarray:
+        """Return rotation and position of all rigid bodies, [R | x], (bodies, 3, 4) or (worlds, bodies, 3, 4); see `BodyState`."""
+        poses = [body_state(self, index) for index in range(len(self.model.bodies))]
+        values = [np.concatenate([pose.rotation, pose.position[..., None]], axis=-1) for pose in poses]
+        return np.stack(values, axis=0 if self.model.worlds == 1 else 1)
 
     def poses(self) -> Floats | None:
         """Return poses of grips (grips, 6) or (worlds, grips, 6) in the order of `model.grips`; None without."""

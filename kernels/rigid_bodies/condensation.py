@@ -36,8 +36,8 @@ def bodies_type(real):
     """Return the struct of rigid bodies, for kernels of solves.
 
     `origins`, `spins`, `carried`, `owner`, `starts`: see `ddg_warp.compile.coupled.rigid_bodies`. `y`, `derivative`: y and D of
-    carried nodes (W C,). `inertia`: gamma P I P^T (W B,). `force`, `moment`: of controls, at the centre of mass (W B,). `center`: carried
-    node that is the centre of mass, -1 for the origin (B,).
+    carried nodes (W C,). `inertia`: gamma P I P^T (W B,). `force`, `moment`: of controls, at the centre of mass (W B,). `center`:
+    carried node that is the centre of mass, -1 for the origin (B,).
     """
     V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
 

@@ -82,6 +82,7 @@ class Model:
     contact_scales: object = None
     worlds: int = 1
     scene: object = None
+    bodies: tuple = ()
 
     def parameters(self) -> dict[str, np.ndarray]:
         return {"bend_stiffness": np.array([1e-3, 2e-3]), "density": np.array(1000.0)}

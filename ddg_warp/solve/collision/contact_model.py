@@ -214,16 +214,20 @@ def _attached(host) -> list[tuple[int, int]]:
         return []
     owner = np.full(host.blocks, -1)
     owner[rigid.carried] = rigid.owner
-    linked = {(body, body) for body in range(len(rigid))}
+    linked = [{body} for body in range(len(rigid))]  # of each rigid body: those without contact with it
     for blocks in rigid.anchors:
         first, second = owner[blocks].tolist()
-        linked |= {(first, second), (second, first)}
-    # rigid bodies of every collision body: its own, or those that carry its nodes
-    holders = [set(owner[body.nodes].tolist()) - {-1} for body in host.contact_parameters.bodies]
-    solid = [body.rigid for body in host.contact_parameters.bodies]
+        for body, other in ((first, second), (second, first)):
+            if body >= 0:
+                linked[body].add(other)
+    held = [[] for _ in range(len(rigid))]  # collision bodies of each rigid body, or with a node that it carries
+    for number, body in enumerate(host.contact_parameters.bodies):
+        for index in set(owner[body.nodes].tolist()) - {-1}:
+            held[index].append(number)
     return [
-        (i, j)
-        for i, first in enumerate(solid)
-        for j, others in enumerate(holders)
-        if first >= 0 and any((first, other) in linked for other in others)
+        (number, other)
+        for number, body in enumerate(host.contact_parameters.bodies)
+        if body.rigid >= 0
+        for index in linked[body.rigid] - {-1}
+        for other in held[index]
     ]

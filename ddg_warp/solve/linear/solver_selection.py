@@ -99,8 +99,10 @@ def coupled_preconditioner(coupled) -> str:
     """
     host = coupled.host
     large = LARGE_IN_CONTACT if host.contact_parameters else LARGE
+    carried = len(host.rigid_bodies.carried) if host.rigid_bodies else 0
+    nodes = host.nodes - carried
     if not host.rods:
-        return "multilevel" if host.nodes >= large else "block_jacobi"
+        return "multilevel" if nodes >= large else "block_jacobi"
     rod_nodes = np.concatenate([rod.all_nodes for rod in host.rods])
     joints = np.bincount(rod_nodes, minlength=host.nodes) > 1
     rigid = np.zeros(host.nodes, bool)
@@ -112,7 +114,7 @@ def coupled_preconditioner(coupled) -> str:
     if pays and coupled.device.is_cuda:
         reduced = long_and_few(places, len(host.rods) * coupled.worlds, coupled.device)
         pays = 0.25 * between**2 > LAUNCHES + (min(places, REDUCED) if reduced else places) / PATH_NODES
-    rest = host.nodes - len(np.unique(rod_nodes)) if pays else host.nodes
+    rest = nodes - len(np.unique(rod_nodes)) if pays else nodes
     names = ["substructuring"] * pays + ["multilevel"] * (rest >= large)
     return "_".join(names) or "block_jacobi"
 

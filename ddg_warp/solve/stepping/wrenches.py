@@ -19,7 +19,6 @@ from ddg_warp.kernels.residual import support_forces
 from ddg_warp.kernels.residual.coupled_residual import inputs_type
 from ddg_warp.kernels.residual.support_forces import ROWS
 from ddg_warp.kernels.stepping import wrench_sums
-from ddg_warp.model.rigid_bodies import refuse_rigid_bodies
 from ddg_warp.scene.handle import OBSTACLE, RING_SUPPORT, SHELL_SUPPORT, SUPPORT, Handle, named
 from ddg_warp.scene.scene import Scene
 from ddg_warp.solve.linear.sparse_system import lists
@@ -110,7 +109,6 @@ class Wrenches:
     """
 
     def __init__(self, model):
-        refuse_rigid_bodies("wrenches", model)
         real, device = model.types.real, model.wp_device
         vector, shape = wp.types.vector(3, real), (model.worlds, support_count(model.scene))
         self.force, self.moment, self.point = (wp.zeros(shape, dtype=vector, device=device) for _ in range(3))
