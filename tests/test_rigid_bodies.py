@@ -211,7 +211,7 @@ def flywheel(rate: float, tilt: float, dt: float, duration: float) -> float:
 def test_flywheel_conserves_momentum():
     """A flywheel that turns by 10 rad a step conserves momentum about its axis; while that turns, to first order in the step."""
     assert flywheel(1000.0, 0.0, 0.01, 0.5) < 1e-12
-    errors = [flywheel(30.0, 0.3, dt, 0.1) for dt in (1e-3, 5e-4)]
+    errors = [flywheel(300.0, 0.3, dt, 0.1) for dt in (1e-3, 5e-4)]
     assert errors[0] < 1e-3
     assert np.log2(errors[0] / errors[1]) == pytest.approx(1.0, abs=0.2)
 
@@ -481,7 +481,7 @@ def test_recorded_poses(tmp_path):
     """A recording holds the poses of bodies, and the surfaces of their shapes as those of moving obstacles."""
     model, integrator, state = build(cube_on_cantilever(2e-3))
     states = []
-    with ddg.Recorder(model, tmp_path / "run") as recorder:
+    with ddg.Recorder(model, tmp_path / "run", usd=False) as recorder:
         for _ in range(3):
             state = integrator.step(state, 0.02)
             recorder.record(state)

@@ -1,14 +1,19 @@
-"""Pile of boxes and rods: time a step, Newton and CG iterations, and completed jittered runs; `python tools/bench_bodies.py --help`."""
+"""Measure a pile of rigid boxes and rods: time a step, Newton and CG iterations, and completed runs from jittered starts.
+
+python tools/bench_bodies.py [--device cuda:0] [--out DIR]       bodies_cpu or bodies_cuda.csv and .json in DIR
+"""
 
 import argparse
-import json
-import sys
 import time
+from pathlib import Path
 
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp.run.summary import machine, table, write_table
 
+ROOT = Path(__file__).parents[1]
+WARM = 2  # first steps, which compile and capture
 SIDE, RADIUS, LENGTH, NODES = 0.02, 1e-3, 0.06, 8  # m: box, rounding and rod radius, rod
 CELL = 0.07  # m, of the grid on which boxes and rods start
 
@@ -40,40 +45,53 @@ def build(count: int, seed: int) -> ddg.Scene:
 
 
 def measure(count: int, seed: int, duration: float, device: str) -> dict:
-    """Return times and iterations of a run, and the outcome."""
+    """Return the row of a run: times, iterations and outcome."""
     scene = build(count, seed)
     model = scene.build(device=device)
     integrator, state, dt = ddg.Integrator(model, rtol=scene.analysis.rtol), model.state(), scene.analysis.dt
-    times, result = [], {"count": count, "seed": seed, "device": device}
+    times, outcome = [], "completed"
     try:
         for _ in range(round(duration / dt)):
             begin = time.perf_counter()
             state = integrator.step(state, dt)
-            state.time  # noqa: B018
             times.append(time.perf_counter() - begin)
-            print(f"step {len(times)}: {times[-1]:.3f} s", file=sys.stderr, flush=True)
-        result["outcome"] = "completed"
     except ddg.SolverError as error:
-        result["outcome"] = str(error)[:300]
+        outcome = error.outcome
     statistics = integrator.statistics()
-    solves = sum(statistics["outcomes"].values())
-    return result | {
+    solves, newton = sum(statistics["outcomes"].values()), statistics["newton_iterations"]
+    return {
+        "seed": seed,
+        "bodies": count,
+        "rods": count,
         "steps": len(times),
-        "seconds a step": float(np.mean(times[2:])) if len(times) > 2 else 0.0,
-        "newton": statistics["newton_iterations"],
-        "cg a newton": statistics["pcg_iterations"] / max(1.0, statistics["newton_iterations"]["mean"] * solves),
-        "outcomes": statistics["outcomes"],
-        "contact": statistics["contact"],
-        "lowest": float(model.contacts(state).gap.min(initial=np.inf)),
+        "seconds_a_step": float(np.mean(times[WARM:])),
+        "newton_mean": newton["mean"],
+        "newton_max": newton["max"],
+        "cg_a_newton": statistics["pcg_iterations"] / max(1.0, newton["mean"] * solves),
+        "solves": solves,
+        "pairs_last": statistics["contact"]["contacts"]["last"],
+        "smallest_gap": statistics["contact"]["smallest_gap"],
+        "outcome": outcome,
     }
 
 
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
+def main() -> None:
+    """Measure all runs and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--count", type=int, default=1000)
-    parser.add_argument("--runs", type=int, default=1)
-    parser.add_argument("--duration", type=float, default=0.5)
+    parser.add_argument("--runs", type=int, default=10)
+    parser.add_argument("--duration", type=float, default=0.3)
     parser.add_argument("--device", default="cpu")
-    options = parser.parse_args()
-    for seed in range(options.runs):
-        print(json.dumps(measure(options.count, seed, options.duration, options.device)), flush=True)
+    parser.add_argument("--out", type=Path, default=ROOT / "tools" / "results")
+    chosen = parser.parse_args()
+    rows = []
+    for seed in range(chosen.runs):
+        rows.append(measure(chosen.count, seed, chosen.duration, chosen.device))
+        print(table(rows[-1:]), flush=True)
+    command = f"python tools/bench_bodies.py --count {chosen.count} --runs {chosen.runs} --duration {chosen.duration:g}"
+    origin = {"command": f"{command} --device {chosen.device}", "machine": machine()}
+    write_table(chosen.out / f"bodies_{'cpu' if chosen.device == 'cpu' else 'cuda'}", rows, origin)
+
+
+if __name__ == "__main__":
+    main()

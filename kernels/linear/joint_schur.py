@@ -46,6 +46,8 @@ def joint_kernels(linear):
     indefinite, which counts in `lost`.
     `solve_joints`: compute z_J.
 
+    `more`, `cross`: blocks of contact on the diagonal and between both blocks of a joint, at b (W N,); empty without.
+
     A joint has one dof block or two (a node and the rotation of its rigid joint), a and b, rows 2 m and 2 m + 1 of all joints. With P
     = S_aa^-1, Q = P S_ab and R = (S_bb - S_ba Q)^-1 the solution is z_b = R (t_b - Q^T t_a), z_a = P t_a - Q z_b.
     """
@@ -114,6 +116,9 @@ def joint_kernels(linear):
         fixed: wp.array(dtype=wp.uint8),
         wanted: wp.array(dtype=int),
         positions: int,
+        blocks: int,
+        more: wp.array(dtype=M),
+        cross: wp.array(dtype=M),
         parts_out: wp.array2d(dtype=M),
         lost: wp.array(dtype=int),
     ):
@@ -141,6 +146,8 @@ def joint_kernels(linear):
                     aa[e, d] = y[e]
             f = free(fixed[a])
             H_aa = block(matrix, block_positions[m, 0] + first)
+            if more.shape[0] > 0:
+                H_aa += more[a + w * blocks]
             P, definite = inverse_or(H_aa + linear(0.5) * (aa + wp.transpose(aa)), H_aa, f)
             if not definite:
                 lost[w] = 1
@@ -162,9 +169,13 @@ def joint_kernels(linear):
             if a >= 0:
                 if block_positions[m, 2] >= 0:
                     ab += block(matrix, block_positions[m, 2] + first)
+                if cross.shape[0] > 0:
+                    ab += cross[b + w * blocks]
                 ab = wp.cw_mul(ab, wp.outer(free(fixed[a]), f))
                 Q = P * ab
             H_bb = block(matrix, block_positions[m, 1] + first)
+            if more.shape[0] > 0:
+                H_bb += more[b + w * blocks]
             R, definite = inverse_or(H_bb + linear(0.5) * (bb + wp.transpose(bb)) - wp.transpose(ab) * Q, H_bb, f)
             if not definite:
                 lost[w] = 1

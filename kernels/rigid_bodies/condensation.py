@@ -14,9 +14,12 @@ import warp as wp
 
 from ddg_warp.kernels.collision.contact.assembly import set_struct
 from ddg_warp.kernels.collision.contact.hessian_product import total_function
+from ddg_warp.kernels.core.division import nonzero_function
 from ddg_warp.kernels.core.inertia import mass_type
 from ddg_warp.kernels.core.islands import ENERGY_BUFFER, INERTIA_COEFFICIENT, LOAD_SCALE, NEEDS_DIRECTION, STATUS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
+from ddg_warp.kernels.linear.coupled_pcg import inverse_function
+from ddg_warp.kernels.linear.joint_schur import coupling_functions
 from ddg_warp.kernels.linear.sliced_ell import inertia_function, product_functions
 from ddg_warp.kernels.measures.joint_curvature_twist import rotations
 from ddg_warp.kernels.residual.coupled_residual import (
@@ -202,7 +205,7 @@ def contact_kernels(real, linear):
     """Build the kernels of contact on carried nodes, one thread a body.
 
     `gather`: add products of pairs at carried nodes to those of the bodies, and p . H p of their blocks.
-    `condense`: add the diagonal blocks of carried nodes to those of the bodies.
+    `condense`: write the diagonal blocks of bodies, and the block between origin and rotation, from the blocks of carried nodes.
     `condense_product`: add products at carried nodes to those of the bodies.
     """
     M, H = wp.types.matrix((3, 3), linear), wp.types.vector(3, linear)
@@ -241,17 +244,20 @@ def contact_kernels(real, linear):
         dots_out[w, s] = wp.dot(p[j], y)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def condense(bodies: Bodies, blocks: int, diagonal: wp.array(dtype=M)):
+    def condense(bodies: Bodies, blocks: int, diagonal: wp.array(dtype=M), cross: wp.array(dtype=M)):
+        """`cross`: block between origin and rotation, at the rotation's block."""
         w, b = wp.tid()
         carried = w * bodies.carried.shape[0]
-        translation, rotation = M(), M()
+        translation, rotation, mixed = M(), M(), M()
         for j in range(bodies.starts[b], bodies.starts[b + 1]):
             K = diagonal[bodies.carried[j] + w * blocks]
             D = M(bodies.derivative[j + carried])
             translation += K
+            mixed += K * D
             rotation += wp.transpose(D) * K * D
         diagonal[bodies.origins[b] + w * blocks] = translation
         diagonal[bodies.spins[b] + w * blocks] = rotation
+        cross[bodies.spins[b] + w * blocks] = mixed
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def condense_product(bodies: Bodies, blocks: int, product: wp.array(dtype=H)):
@@ -267,3 +273,87 @@ def contact_kernels(real, linear):
         product[j] = product[j] + moment
 
     return gather, condense, condense_product
+
+
+@cache
+def preconditioner_kernels(linear):
+    """Build the kernels of the block Jacobi preconditioner of bodies, by the 6 x 6 block of each.
+
+    `factorise`: write P = H_cc^-1, Q = P H_cw and R = (H_ww - H_wc Q)^-1, with contact.
+    `apply`: write z_w = R (r_w - Q^T r_c), z_c = P r_c - Q z_w, and r . z.
+    """
+    M, H = wp.types.matrix((3, 3), linear), wp.types.vector(3, linear)
+    invert, (_, block), (_, free) = inverse_function(linear), coupling_functions(linear), product_functions(linear)
+    nonzero = nonzero_function(linear)
+
+    @wp.func
+    def inverse_of(m: M, f: H):
+        """Return the inverse on free dofs f, that of the diagonal if m is not definite."""
+        inverse, definite = invert(wp.cw_mul(m, wp.outer(f, f)), f)
+        if not definite:
+            inverse = M()
+            for d in range(3):
+                inverse[d, d] = f[d] / nonzero(wp.abs(m[d, d]))
+        return inverse
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def factorise(
+        origins: wp.array(dtype=int),
+        spins: wp.array(dtype=int),
+        crossing: wp.array(dtype=int),
+        diagonal: wp.array(dtype=int),
+        matrix: wp.array2d(dtype=linear),
+        positions: int,
+        more: wp.array(dtype=M),
+        cross: wp.array(dtype=M),
+        inactive_mask: wp.array(dtype=wp.uint8),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        parts_out: wp.array2d(dtype=M),
+    ):
+        """`crossing`: position of H_cw of each body, -1 without; `more`, `cross`: of contact, empty without."""
+        w, b = wp.tid()
+        if wanted[w] == 0:
+            return
+        first, c, s = w * positions, origins[b], spins[b]
+        i, j = c + w * blocks, s + w * blocks
+        aa, ab, bb = block(matrix, diagonal[c] + first), M(), block(matrix, diagonal[s] + first)
+        if crossing[b] >= 0:
+            ab += block(matrix, crossing[b] + first)
+        if more.shape[0] > 0:
+            aa += more[i]
+            ab += cross[j]
+            bb += more[j]
+        f, g = free(inactive_mask[i]), free(inactive_mask[j])
+        ab = wp.cw_mul(ab, wp.outer(f, g))
+        P = inverse_of(aa, f)
+        Q = P * ab
+        k = b + w * origins.shape[0]
+        parts_out[0, k] = P
+        parts_out[1, k] = Q
+        parts_out[2, k] = inverse_of(bb - wp.transpose(ab) * Q, g)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def apply(
+        origins: wp.array(dtype=int),
+        spins: wp.array(dtype=int),
+        parts: wp.array2d(dtype=M),
+        residual: wp.array(dtype=H),
+        wanted: wp.array(dtype=int),
+        blocks: int,
+        z_out: wp.array(dtype=H),
+        dots_out: wp.array2d(dtype=linear),
+    ):
+        w, b = wp.tid()
+        if wanted[w] != 1:
+            return
+        c, s, k = origins[b], spins[b], b + w * origins.shape[0]
+        i, j = c + w * blocks, s + w * blocks
+        turn = parts[2, k] * (residual[j] - residual[i] * parts[1, k])
+        shift = parts[0, k] * residual[i] - parts[1, k] * turn
+        z_out[i] = shift
+        z_out[j] = turn
+        dots_out[w, c] = wp.dot(residual[i], shift)
+        dots_out[w, s] = wp.dot(residual[j], turn)
+
+    return factorise, apply

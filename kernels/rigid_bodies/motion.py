@@ -194,31 +194,60 @@ def depart_kernel(real):
 
 
 @cache
-def shorten_kernel(real, linear):
-    """Build the kernel `shorten`: raise the squared rotations of worlds so that updates turn no body by more than `longest`.
+def arc_kernels(real):
+    """Build the kernels that bound rotations in one motion, which CCD takes as straight.
 
-    The rotation of a body counts by `cap` over `longest`, where `cap` is the largest rotation of other updates [rad].
+    `measure`: write the fraction of a motion that turns no body of a CCD body by more than `longest`, and the least one of each world.
+    `shorten`: take that fraction of the motion, each CCD body its own, or all the least one of their world.
+    `note`: let the fractions of worlds be at most the least one.
     """
-    H = wp.types.vector(3, linear)
+    V = wp.types.vector(3, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def measure(
+        start: wp.array(dtype=V),
+        q: wp.array(dtype=V),
+        spins: wp.array(dtype=int),
+        longest: wp.array(dtype=real),
+        ccd_body: wp.array(dtype=int),
+        num_ccd_bodies: int,
+        fractions: wp.array(dtype=real),
+        least: wp.array(dtype=real),
+    ):
+        w, b = wp.tid()
+        k = spins[b] + w * ccd_body.shape[0]
+        angle = wp.length(q[k] - start[k])
+        if angle > longest[b]:
+            fraction = longest[b] / angle
+            wp.atomic_min(fractions, ccd_body[spins[b]] + w * num_ccd_bodies, fraction)
+            wp.atomic_min(least, w, fraction)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def shorten(
-        direction: wp.array(dtype=H),
-        spins: wp.array(dtype=int),
-        longest: wp.array(dtype=real),
-        cap: real,
-        blocks: int,
-        wanted: wp.array(dtype=int),
-        rotation: wp.array(dtype=real),
+        start: wp.array(dtype=V),
+        ccd_body: wp.array(dtype=int),
+        num_ccd_bodies: int,
+        together: wp.array(dtype=int),
+        fractions: wp.array(dtype=real),
+        least: wp.array(dtype=real),
+        q: wp.array(dtype=V),
     ):
-        w, b = wp.tid()
-        if wanted[w] == 0:
+        w, k = wp.tid()
+        if least[w] >= real(1.0) or ccd_body[k] < 0:
             return
-        turn = direction[spins[b] + w * blocks]
-        scale = cap / longest[b]
-        wp.atomic_max(rotation, w, real(wp.dot(turn, turn)) * scale * scale)
+        fraction = fractions[ccd_body[k] + w * num_ccd_bodies]
+        if together[w] != 0:
+            fraction = least[w]
+        i = k + w * ccd_body.shape[0]
+        if fraction < real(1.0):
+            q[i] = start[i] + (q[i] - start[i]) * fraction
 
-    return shorten
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def note(least: wp.array(dtype=real), time: wp.array(dtype=real)):
+        w = wp.tid()
+        time[w] = wp.min(time[w], least[w])
+
+    return measure, shorten, note
 
 
 @cache

@@ -51,7 +51,11 @@ class CondensationPlan:
     def bind(
         self, keys: np.ndarray, position: np.ndarray, raw_position: np.ndarray, blocks: int
     ) -> dict[str, np.ndarray]:
-        """Return the arrays of `condense_kernel` by name, given sorted keys row * blocks + column and positions of all entries."""
+        """Return the arrays of `condense_kernel` by name, and the position `crossing` between origin and rotation of each body.
+
+        Args:
+            keys: row * blocks + column of all entries but raw ones, sorted; position: their positions; raw_position: of raw entries.
+        """
         rigid = self.rigid
         own = np.concatenate([rigid.origins, rigid.spins])
         keys_of_terms = self.rows.astype(np.int64) * blocks + self.columns
@@ -62,12 +66,15 @@ class CondensationPlan:
         turning = np.full(blocks, -1)
         turning[rigid.spins] = np.arange(len(rigid))
         order = np.argsort(keys_of_terms, kind="stable")
+        crossing = rigid.origins.astype(np.int64) * blocks + rigid.spins
+        place = np.minimum(np.searchsorted(keys, crossing), len(keys) - 1)
         return {
             "targets": position[np.searchsorted(keys, wanted)],
             "rows": np.where(row == column, row, -1),
             "turning": np.where(row == column, turning[row], -1),
             "starts": np.append(np.searchsorted(keys_of_terms[order], wanted), len(order)),
             "sources": raw_position[self.source[order]],
+            "crossing": np.where(keys[place] == crossing, position[place], -1),
             "left": self.left[order],
             "right": self.right[order],
         }

@@ -35,7 +35,12 @@ class PathJoints:
         self._factors = wp.zeros((3, max(1, worlds * self.count)), dtype=M, device=device)
         self._responses = paths.allocate(plan.block, linear, len(plan.units))
         self._load, self._follow, self._finish = kernels
+        self._contact = [wp.zeros(0, dtype=M, device=device)] * 2
         self._factorise, self._solve = joint_schur.joint_kernels(linear) if self.count else (None, None)
+
+    def add_contact(self, diagonal: wp.array, cross: wp.array) -> None:
+        """Add blocks of contact to joints from now on: on the diagonal, and between both blocks of a joint (W N,)."""
+        self._contact = [diagonal, cross]
 
     def kernels(self, walks: bool, alone: bool) -> list:
         """Kernels to load before a capture, given whether a fused kernel walks and the elimination applies `alone`."""
@@ -50,7 +55,7 @@ class PathJoints:
             self._right_hand_sides(system, system.outdated, self._responses, None, self._units)
             elimination.solve(blocks, self._responses, system.outdated, lost)
         inputs = [system.matrix, *self._inputs(self._responses), self._own, self._colour, self._size]
-        inputs += [system.masks.fixed, system.outdated, self.sparsity.positions]
+        inputs += [system.masks.fixed, system.outdated, self.sparsity.positions, self.coupled.blocks, *self._contact]
         self._launch(self._factorise, self.coupled.worlds * self.count, inputs, [self._factors, lost])
 
     def eliminate(self, system, elimination, blocks: wp.array, residual: wp.array, lost: wp.array) -> None:

@@ -119,6 +119,8 @@ class PCG:
         )
         if self.substructuring:
             self.substructuring.prepare(system, self._unread[0])
+        elif self._rigid_bodies:
+            self._rigid_bodies.factorise(system, self._more)
         if self.levels:
             self.levels.prepare(system, self._more, iteration)
         self.precondition(system, self.p)
@@ -142,6 +144,8 @@ class PCG:
         """Apply substructuring and multilevel to z, on entry the residual times inverse diagonal blocks; write r . z."""
         if self.substructuring:
             self.substructuring.apply(system, self.rest, z, self._unread[0])
+        elif self._rigid_bodies:
+            self._rigid_bodies.precondition(system, self.rest, z)
         if self.levels:
             self.levels.apply(self.rest, system.masks.inactive, system.wanted, z, system.dots)
 

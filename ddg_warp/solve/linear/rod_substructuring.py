@@ -93,6 +93,10 @@ class RodSubstructuring:
             stiffened = coupled.has_quadratic_matrix(quadratic)
             self._walk = walk_kernel(*of_terms, stiffened, self._joints.count > 0)
 
+    def add_contact(self, diagonal: wp.array, cross: wp.array) -> None:
+        """Add blocks of contact to joints from now on; see `PathJoints`."""
+        self._joints.add_contact(diagonal, cross)
+
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""

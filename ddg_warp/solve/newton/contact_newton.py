@@ -38,6 +38,7 @@ class NewtonContact:
         `limit`, `pending`: CCD limit of proposed motions, and the remainder of limited motions.
         `diagnosis`, `tally`: messages on failures, and statistics of all steps so far.
         bodies: body of each block of a world (blocks,), -1 for none; and the largest possible number of bodies.
+        `rigid_bodies`: `RigidBodies` that carry nodes, None without.
         `bends`: True if the matrix has the geometric stiffness of pairs; see `kernels.collision.contact.geometric_stiffness`.
         `has_friction`: True with friction; rate: inverse time over which slips count (worlds,) [1/s].
         solutions: positions of the last step at which friction was updated, in order, for the reverse pass: `friction_iterations` -
@@ -55,6 +56,7 @@ class NewtonContact:
         touch = ContactModel(coupled, linear, iterates.q, host.of_obstacles)
         self.search, self.terms, self.bodies = touch.search, touch.terms, number_bodies(host)
         self.hessian = ContactHessian(self.terms, touch.shapes)
+        self.rigid_bodies = None
         self.limit, self.pending = StepLimit(model, touch, self.bodies), PendingMotion(model, linear)
         self.diagnosis, self.tally = ContactDiagnosis(model, touch), ContactStatistics(self.terms)
         self.has_friction, self.rate = host.contact_parameters.has_friction, rate
@@ -113,15 +115,11 @@ class NewtonContact:
             self._launch(self._brace, [*islands.arrays, dt], [self._braced, self.terms.law.rate])
 
     @timer("CCD filter")
-    def place(self, iterates, system, islands, rigid_bodies=None) -> None:
-        """Limit the predictor by CCD, once supports are at their prescribed positions.
-
-        Args:
-            rigid_bodies: `RigidBodies` or None.
-        """
+    def place(self, iterates, system, islands) -> None:
+        """Limit the predictor by CCD, once supports are at their prescribed positions."""
         self.pending.aim(iterates)
         self.limit.begin(islands, self.pending, predictor=True)
-        self._limit(iterates, system, islands, rigid_bodies)
+        self._limit(iterates, system, islands)
         self.limit.mark_limited(islands)
         self.pending.end(iterates, islands)
 
@@ -147,21 +145,22 @@ class NewtonContact:
         self.hessian.assemble()
 
     @timer("CCD filter")
-    def hold(self, iterates, search, system, islands, rigid_bodies=None) -> None:
-        """Limit the trial step by CCD, and write its predicted decrease; `rigid_bodies`: see `place`."""
+    def hold(self, iterates, search, system, islands) -> None:
+        """Limit the trial step by CCD, and write its predicted decrease."""
         modes, blocks = self.limit.modes, self.coupled.blocks
         self.limit.begin(islands, self.pending)
         self.pending.land(iterates, system, islands, modes)
-        self._limit(iterates, system, islands, rigid_bodies)
+        self._limit(iterates, system, islands)
         self.pending.end(iterates, islands)
         self.coupled.sweep(self._differ_gain, [system.rhs, iterates.q, iterates.base, modes, blocks], [self._dots])
         self._sum(self._dots, self._gain)
         inputs = [modes, self.search.time, self._gain]
         self._launch(self._expect, inputs, [*islands.arrays, search.stalled, self._projected])
 
-    def _limit(self, iterates, system, islands, rigid_bodies) -> None:
-        """Limit the proposed motion by CCD, that of supports included."""
-        self.limit(iterates, rigid_bodies and partial(rigid_bodies.place, iterates, islands))
+    def _limit(self, iterates, system, islands) -> None:
+        """Limit the proposed motion by CCD, with the motion of supports."""
+        bodies = self.rigid_bodies
+        self.limit(iterates, bodies and partial(bodies.place, iterates, islands), bodies)
         self.pending.arrive(iterates, system, islands, self.limit.modes)
 
     @timer("interpenetration check")

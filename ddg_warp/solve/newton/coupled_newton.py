@@ -162,6 +162,10 @@ class CoupledNewton:
                 coupled.bodies, self.sparsity, self.linear, quadratic, stiffened, outer is not None
             )
             self.residual.leave_out(self.rigid_bodies)
+            if self.contact:
+                self.contact.rigid_bodies = self.rigid_bodies
+            if self.contact and self.substructuring:
+                self.substructuring.add_contact(self.contact.hessian.diagonal, self.rigid_bodies.cross)
         self.line_search = LineSearch(coupled, self.linear, most > 0)
         self._worst = Sums(coupled.worlds, self.tolerances.ratio.shape[1], real, coupled.device, largest=True)
         lengthened = self.substructuring if any(self.elements.mixed_axial) else None
@@ -284,7 +288,7 @@ class CoupledNewton:
         if self.edge_rotations:
             wp.capture_if(self.islands.any_edge_rotation, lambda: self._rotate(state))
         if self.contact:
-            self.contact.hold(self.iterates, self.search_state, self.system, self.islands, self.rigid_bodies)
+            self.contact.hold(self.iterates, self.search_state, self.system, self.islands)
 
     def _find_direction(self) -> None:
         """Compute search directions and step lengths of worlds that do not backtrack."""
@@ -390,9 +394,6 @@ class CoupledNewton:
         if self.planes:
             self.planes.back(self.system.direction, self.system.wanted)
         self.line_search.measure_rotation(self.iterates, self.search_state, self.system)
-        if self.rigid_bodies:
-            cap, search = self.options.rotation_cap, self.search_state
-            self.rigid_bodies.shorten(self.system.direction, cap, self.system.wanted, search.rotation)
 
     @timer("edge rotation")
     def _rotate(self, state) -> None:

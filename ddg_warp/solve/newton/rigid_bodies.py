@@ -19,6 +19,8 @@ class RigidBodies:
     Attributes:
         predicted: orientations after the torque-free flight (W B,).
         longest: largest rotation of each body in one motion that contact limits (B,) [rad].
+        cross: blocks of contact between origin and rotation of bodies, at blocks of rotations (W N,); empty without contact.
+        least: least fraction of the motion of each world after `bound_rotations` (worlds,).
         bodies: struct of kernels, with y and D of carried nodes and the inertia of rotations.
     """
 
@@ -38,17 +40,33 @@ class RigidBodies:
         struct.center = tables.center
         longest = _longest_arcs(coupled.host) if self._touches else np.full(bodies, np.inf)
         self.longest = wp.array(longest, dtype=real, device=device)
-        self._shorten = motion.shorten_kernel(real, linear)
+        self._fractions, self.least = (
+            wp.zeros(n, dtype=real, device=device) for n in (worlds * coupled.blocks, worlds)
+        )
+        self._measure, self._shorten, self._note = motion.arc_kernels(real)
         self._place, self._spread = motion.place_kernel(real), motion.spread_kernel(real, linear)
         self._balance = condensation.balance_kernel(real, linear, quadratic, outer)
+        M = wp.types.matrix((3, 3), linear)
+        self.cross = wp.zeros(worlds * coupled.blocks if self._touches else 0, dtype=M, device=device)
+        self._factors = wp.zeros((3, worlds * bodies), dtype=M, device=device)
+        self._factorise, self._apply = condensation.preconditioner_kernels(linear)
         self._gather, self._condense_diagonal, self._condense_product = condensation.contact_kernels(real, linear)
         self._condense = condensation.condense_kernel(real, linear, inertia_structs, not coupled.sets)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        contact = [self._gather, self._condense_diagonal, self._condense_product, self._shorten]
-        return [self._place, self._spread, self._balance, self._condense, *(contact if self._touches else [])]
+        contact = [self._gather, self._condense_diagonal, self._condense_product]
+        contact += [self._measure, self._shorten, self._note]
+        return [
+            self._place,
+            self._spread,
+            self._balance,
+            self._condense,
+            self._factorise,
+            self._apply,
+            *(contact if self._touches else []),
+        ]
 
     def place(self, iterates, islands) -> None:
         """Place carried nodes at the iterate."""
@@ -63,15 +81,24 @@ class RigidBodies:
         inputs = [self.bodies.derivative, tables.owner, tables.carried, tables.origins, tables.spins]
         self._launch(self._spread, self._carried, [*inputs, self.coupled.blocks], [direction])
 
-    def shorten(self, direction: wp.array, cap: float, wanted: wp.array, rotation: wp.array) -> None:
-        """Raise the squared rotations of worlds (worlds,) so that updates in contact turn no body by more than its `longest`.
+    def bound_rotations(self, start: wp.array, q: wp.array, ccd_body: wp.array, num_ccd_bodies: int, together) -> None:
+        """Shorten the motions from `start` to q that turn a body by more than its `longest`.
 
         Args:
-            cap: largest rotation of updates [rad].
+            ccd_body: CCD body of every block; together: (worlds,), nonzero where all move by one fraction.
         """
-        if self._touches:
-            inputs = [direction, self.tables.spins, self.longest, cap, self.coupled.blocks, wanted]
-            self._launch(self._shorten, len(self.tables), inputs, [rotation])
+        worlds, fractions = self.coupled.worlds, self._fractions[: self.coupled.worlds * num_ccd_bodies]
+        fractions.fill_(1.0)
+        self.least.fill_(1.0)
+        bodies = [ccd_body, num_ccd_bodies]
+        inputs = [start, q, self.tables.spins, self.longest, *bodies]
+        self._launch(self._measure, len(self.tables), inputs, [fractions, self.least])
+        inputs = [start, *bodies, together, fractions, self.least]
+        wp.launch(self._shorten, (worlds, self.coupled.blocks), inputs, [q], device=self.coupled.device)
+
+    def note_fractions(self, time: wp.array) -> None:
+        """Let step fractions (worlds,) be at most those of `bound_rotations`."""
+        wp.launch(self._note, self.coupled.worlds, [self.least], [time], device=self.coupled.device)
 
     def gather(self, products, p: wp.array, product: wp.array, system) -> None:
         """Add the products of contact pairs at carried nodes, see `PairProduct.settle`, to those of the bodies."""
@@ -79,8 +106,22 @@ class RigidBodies:
         self._launch(self._gather, len(self.tables), inputs, [product, system.dots])
 
     def condense_contact(self, diagonal: wp.array) -> None:
-        """Add the diagonal blocks of contact at carried nodes to those of the bodies."""
-        self._launch(self._condense_diagonal, len(self.tables), [self.bodies, self.coupled.blocks], [diagonal])
+        """Write the diagonal blocks of contact of bodies, and `cross`, from the blocks of carried nodes."""
+        inputs = [self.bodies, self.coupled.blocks]
+        self._launch(self._condense_diagonal, len(self.tables), inputs, [diagonal, self.cross])
+
+    def factorise(self, system, more: wp.array) -> None:
+        """Factorise the blocks of bodies for `precondition`; `more`: diagonal blocks of contact (W N,), empty without."""
+        tables, table = self.tables, self.sparsity
+        inputs = [tables.origins, tables.spins, table.condensed["crossing"], table.diagonal, system.matrix]
+        inputs += [table.positions, more, self.cross, system.masks.inactive, system.outdated, self.coupled.blocks]
+        self._launch(self._factorise, len(tables), inputs, [self._factors])
+
+    def precondition(self, system, residual: wp.array, z: wp.array) -> None:
+        """Write z of bodies from the residual, and r . z block by block."""
+        tables = self.tables
+        inputs = [tables.origins, tables.spins, self._factors, residual, system.wanted, self.coupled.blocks]
+        self._launch(self._apply, len(tables), inputs, [z, system.dots])
 
     def condense_product(self, product: wp.array) -> None:
         """Add a product at carried nodes to that of the bodies."""

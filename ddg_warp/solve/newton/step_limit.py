@@ -47,16 +47,21 @@ class StepLimit:
         kernel = self._find_predicted if predictor else self._find_modes
         self._launch(kernel, [islands.arrays[0]], [self.modes, self._longest, pending.going])
 
-    def __call__(self, iterates, place: Callable[[], None] | None = None) -> None:
+    def __call__(self, iterates, place: Callable[[], None] | None = None, rigid_bodies=None) -> None:
         """Limit the proposed motion from `base` to `q`; `proposed` keeps the proposed end.
 
         Args:
             place: places the nodes that rigid bodies carry at q. A limited body ends on its arc, beside the straight motions that have
                 been searched. Its straight motions to there are then limited in turn, up to `ARC_ROUNDS` times.
+            rigid_bodies: `RigidBodies`, whose rotations are bounded, or None.
         """
         q, blocks, far = iterates.q, self.coupled.blocks, FAR * self.search.margin
         inputs = [q, iterates.base, self._ccd_body, self.coupled.host.nodes, far, blocks]
         self.coupled.sweep(self._stay, inputs, [self._start, self.modes, iterates.proposed, self._longest])
+        if place:
+            bodies = self._ccd_body, self._num_ccd_bodies
+            rigid_bodies.bound_rotations(self._start, q, *bodies, self.modes)
+            place()
         shorter = [self.modes, self._longest, self.farthest]
         if self.farthest < math.inf:
             self.coupled.sweep(self._near, [self._start, self._ccd_body, *shorter, blocks], [q])
@@ -66,6 +71,7 @@ class StepLimit:
         if self.farthest < math.inf:
             self._launch(self._less, shorter, [self.search.time])
         if place:
+            rigid_bodies.note_fractions(self.search.time)
             self._follow_arcs(q, place)
 
     def _follow_arcs(self, q: wp.array, place: Callable[[], None]) -> None:

@@ -196,7 +196,9 @@ class StepDriver:
                 self.warm_start(before)
         if contact:
             contact.place(
-                newton.iterates, newton.system, self.islands, newton.rigid_bodies
+                newton.iterates,
+                newton.system,
+                self.islands,
             )  # CCD filter of the predictor
             contact.lag(before.q, rate=before.rate)
         self.solve(start)  # Newton's method
