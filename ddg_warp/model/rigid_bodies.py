@@ -7,6 +7,7 @@ import warp as wp
 
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.rigid_bodies import motion
+from ddg_warp.typing import Floats
 
 
 class RigidBodyTables:
@@ -78,10 +79,10 @@ class BodyState:
         angular_velocity: in space (3,) [rad/s].
     """
 
-    position: np.ndarray
-    rotation: np.ndarray
-    velocity: np.ndarray
-    angular_velocity: np.ndarray
+    position: Floats
+    rotation: Floats
+    velocity: Floats
+    angular_velocity: Floats
 
 
 def body_state(state, index: int) -> BodyState:

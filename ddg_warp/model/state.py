@@ -307,7 +307,7 @@ class State:
         """
         return body_state(self, named(BODY, item, self.model.bodies))
 
-    def body_poses(self) -> np.ndarray:
+    def body_poses(self) -> Floats:
         """Return rotation and position of all rigid bodies, [R | x], (bodies, 3, 4) or (worlds, bodies, 3, 4); see `BodyState`."""
         poses = [body_state(self, index) for index in range(len(self.model.bodies))]
         values = [np.concatenate([pose.rotation, pose.position[..., None]], axis=-1) for pose in poses]

@@ -10,6 +10,7 @@ from ddg_warp.errors import SceneError
 from ddg_warp.geometry.mass_properties import mass_properties
 from ddg_warp.scene.handle import BODY, BODY_JOINT, SHELL, Handle, need
 from ddg_warp.scene.obstacles import Capsule, Mesh, Sphere
+from ddg_warp.typing import Numbers, Vector
 
 LEAST_MOMENT = 1e-9  # smallest principal moment over the largest one, of which float64 resolves a free rotation
 
@@ -99,10 +100,10 @@ class RigidBodies:
         *,
         density: float | None = None,
         mass: float | None = None,
-        inertia=None,
-        center=None,
-        velocity=(0.0, 0.0, 0.0),
-        angular_velocity=(0.0, 0.0, 0.0),
+        inertia: Numbers | None = None,
+        center: Vector | None = None,
+        velocity: Vector = (0.0, 0.0, 0.0),
+        angular_velocity: Vector = (0.0, 0.0, 0.0),
         name: str = "body",
     ) -> Handle:
         """Add a rigid body of uniform density within shapes, or of given mass and inertia; return its handle.
@@ -157,7 +158,9 @@ class RigidBodies:
         self.bodies.append(RigidBody(mass, np.array(middle), moments, axes, *rates, shapes, name))
         return Handle(len(self.bodies) - 1, BODY, name)
 
-    def ball(self, first, second=None, *, point, stiffness: float | None = None, name: str = "") -> Handle:
+    def ball(
+        self, first: int, second: int | None = None, *, point: Vector, stiffness: float | None = None, name: str = ""
+    ) -> Handle:
         """Join two bodies at a point, or a body to the world there, about which they rotate freely; return the handle.
 
         Args:
@@ -174,11 +177,11 @@ class RigidBodies:
 
     def hinge(
         self,
-        first,
-        second=None,
+        first: int,
+        second: int | None = None,
         *,
-        point,
-        axis,
+        point: Vector,
+        axis: Vector,
         angle: float | Callable[[float], float] | None = None,
         torque: float | Callable[[float], float] | None = None,
         damping: float = 0.0,
@@ -223,7 +226,15 @@ class RigidBodies:
         options = {"angle": angle, "torque": torque, "damping": float(damping), "stops": stops}
         return self._add_joint("hinge", first, second, point, axis, stiffness=stiffness, name=name, **options)
 
-    def weld(self, first, second=None, *, point=None, stiffness: float | None = None, name: str = "") -> Handle:
+    def weld(
+        self,
+        first: int,
+        second: int | None = None,
+        *,
+        point: Vector | None = None,
+        stiffness: float | None = None,
+        name: str = "",
+    ) -> Handle:
         """Join two bodies rigidly, or a body to the world, up to the stiffness; return the handle.
 
         Args:
