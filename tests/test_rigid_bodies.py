@@ -493,3 +493,41 @@ def test_recorded_poses(tmp_path):
             assert np.array_equal(reader.body_poses[frame][0, :, :3], pose.rotation)
             corners = reader.obstacle_points[frame]
             assert np.linalg.norm(corners - pose.position, axis=1) == pytest.approx(0.01 * np.sqrt(3.0), rel=1e-6)
+
+
+def test_joints_transmit_weights():
+    """Two hanging bodies: the upper joint carries both weights, the lower one its own; a welded arm has its moment."""
+    scene = ddg.Scene(mass_damping=5.0)
+    upper = scene.add_body(mass=2.0, inertia=(1e-2,) * 3, center=(0, 0, -0.1))
+    lower = scene.add_body(mass=1.0, inertia=(1e-2,) * 3, center=(0, 0, -0.3))
+    top = scene.ball(upper, point=(0, 0, 0), name="top")
+    scene.ball(upper, lower, point=(0, 0, -0.2), name="middle")
+    arm = scene.add_body(mass=1.0, inertia=(1e-2,) * 3, center=(0.3, 0, 0))
+    scene.weld(arm, point=(0.1, 0, 0), name="arm")
+    model, integrator, state = build(scene)
+    for _ in range(20):
+        state = integrator.step(state, 0.01)
+    wrenches = integrator.joint_wrenches(state)
+    for name, weight, moment in (("top", 3.0, 0.0), ("middle", 1.0, 0.0), ("arm", 1.0, -0.2)):
+        assert wrenches[name].force == pytest.approx([0, 0, weight * GRAVITY], abs=1e-4)
+        assert wrenches[name].moment == pytest.approx([0, moment * GRAVITY, 0], abs=1e-4)
+    assert wrenches[top].point == pytest.approx(np.zeros(3))
+    model = cube_on_cantilever(0.0).build(device=DEVICE, precision="float64")
+    with pytest.raises(ddg.SceneError, match="no joint of rigid bodies"):
+        model.joint_wrenches(model.state())
+
+
+def test_pins_balance_inertia():
+    """A body on a string of length l at the rate w pulls its pin by m l w^2; the motor's torque is I times its acceleration."""
+    scene = ddg.Scene(gravity=(0, 0, 0))
+    body = scene.add_body(mass=2.0, inertia=(1e-2,) * 3, center=(0.5, 0, 0), angular_velocity=(0, 0, 3.0))
+    scene.hinge(body, point=(0, 0, 0), axis=(0, 0, 1))
+    wheel = scene.add_body(mass=1.0, inertia=(2e-2,) * 3, center=(0, 5, 0))
+    scene.hinge(wheel, point=(0, 5, 0), axis=(0, 0, 1), angle=lambda t: 2.0 * t * t, name="motor")
+    _model, integrator, state = build(scene)
+    for _ in range(50):
+        state = integrator.step(state, 1e-3)
+    pull, motor = integrator.joint_wrenches(state)
+    along = state.body(body).position / 0.5
+    assert pull.force == pytest.approx(-2.0 * 0.5 * 9.0 * along, rel=1e-2, abs=0.05)
+    assert motor.moment == pytest.approx([0, 0, 2e-2 * 4.0], rel=1e-4, abs=1e-9)

@@ -26,7 +26,7 @@ from ddg_warp.model.joint_drives import JointDrives
 from ddg_warp.model.parameters import valid_numbers
 from ddg_warp.model.rebuild import ModelBuilder
 from ddg_warp.model.rod_group import RodGroup
-from ddg_warp.model.state import GripState, RodGroupState, Snapshot, State, check_state
+from ddg_warp.model.state import GripState, RodGroupState, Snapshot, State, check_state, query
 from ddg_warp.model.user_numbering import UserNumbering
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.handle import OBSTACLE, ROD, SHELL, Handle
@@ -35,6 +35,7 @@ from ddg_warp.typing import Bools, Device, Floats, Numbers, Precision, Vector
 
 if TYPE_CHECKING:
     from ddg_warp.io.contact_records import Contacts
+    from ddg_warp.postprocess.joint_wrenches import JointWrenches
     from ddg_warp.postprocess.quantities import Drag
     from ddg_warp.postprocess.resultants import Stresses
     from ddg_warp.solve.collision.contact_model import ContactModel
@@ -231,6 +232,23 @@ class Model:
         return energies(self, state)
 
     @one_at_a_time
+    def joint_wrenches(self, state: State, factor: float = 1.0) -> "JointWrenches":
+        """Return the wrench of every joint of rigid bodies on its second body in an equilibrium, about the point of the joint.
+
+        A joint with the world acts on the body. `Integrator.joint_wrenches` is for a step, with inertia.
+
+        Args:
+            factor: the load parameter.
+
+        Raises:
+            SceneError: the scene has no joint of rigid bodies.
+        """
+        from ddg_warp.postprocess.joint_wrenches import of_equilibrium, require_joints
+
+        require_joints("joint_wrenches", self)
+        query("joint_wrenches", self, state)
+        return of_equilibrium(self, state, factor)
+
     def reactions(self, state: State, point: Vector | None = None, factor: float = 1.0) -> "Reactions":
         """Return forces and moments of the supports; see `ddg_warp.postprocess.quantities.reactions`."""
         from ddg_warp.postprocess.quantities import reactions

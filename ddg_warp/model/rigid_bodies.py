@@ -16,7 +16,7 @@ class RigidBodyTables:
     Attributes:
         `host`: `RigidBodyArrays`.
         `origins`, `spins`, `carried`, `owner`, `starts`, `arms`: see there.
-        center: carried node that is the centre of mass (B,), -1 for the origin.
+        `centers`: see there; center: carried node that is the centre of mass (B,), -1 for the origin.
         moments: principal moments of inertia (W B,).
     """
 
@@ -30,7 +30,7 @@ class RigidBodyTables:
             setattr(self, name, put(getattr(host, name)))
         place = np.full(coupled.blocks, -1)
         place[host.carried] = np.arange(len(host.carried))
-        self.center = put(place[host.centers])
+        self.center, self.centers = put(place[host.centers]), put(host.centers)
         self.matrix = wp.types.matrix((3, 3), coupled.real)
         self.arms = wp.array(host.arms.reshape(-1, 3), dtype=coupled.vector, device=device)
         self.moments = wp.array(np.tile(host.moments, (coupled.worlds, 1)), dtype=coupled.vector, device=device)

@@ -40,7 +40,8 @@ def bodies_type(real):
 
     `origins`, `spins`, `carried`, `owner`, `starts`: see `ddg_warp.compile.coupled.rigid_bodies`. `y`, `derivative`: y and D of
     carried nodes (W C,). `inertia`: gamma P I P^T (W B,). `force`, `moment`: of controls, at the centre of mass (W B,). `center`:
-    carried node that is the centre of mass, -1 for the origin (B,).
+    carried node that is the centre of mass, -1 for the origin (B,). `sum_force`, `sum_moment`: sums of all forces on bodies, inertia
+    included, with those along fixed dofs, written by the residual (W B,).
     """
     V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
 
@@ -56,6 +57,8 @@ def bodies_type(real):
         force: wp.array(dtype=V)
         moment: wp.array(dtype=V)
         center: wp.array(dtype=int)
+        sum_force: wp.array(dtype=V)
+        sum_moment: wp.array(dtype=V)
 
     return Bodies
 
@@ -134,6 +137,8 @@ def balance_kernel(real, linear, quadratic: bool, contact: bool):
             outputs.least[i] = real(0.0)
             outputs.change[w, k_j] = f_change
             outputs.rounding_error[w, k_j] = f_rounding
+        bodies.sum_force[body] = force
+        bodies.sum_moment[body] = moment
         scale = scalars[LOAD_SCALE, w]
         settle(inputs, outputs, flags, scale, center, k, w, force, size, stiff, change, rounding)
         settle(inputs, outputs, flags, scale, spin, s, w, moment, moment_size, moment_stiff, work, moment_rounding)

@@ -383,3 +383,30 @@ def carry_kernel(real):
         v[carried[j] + first] = v[origins[b] + first] + wp.cross(omega, y)
 
     return carry
+
+
+@cache
+def accelerate_kernel(real, midpoint: bool):
+    """Build the kernel `accelerate`: mean accelerations of the centres of mass over accepted substeps."""
+    V = wp.types.vector(3, real)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def accelerate(
+        before: wp.array(dtype=V),
+        after: wp.array(dtype=V),
+        centers: wp.array(dtype=int),
+        blocks: int,
+        flags: wp.array2d(dtype=int),
+        scalars: wp.array2d(dtype=real),
+        acceleration: wp.array(dtype=V),
+    ):
+        w, b = wp.tid()
+        if flags[SUBSTEP_ACCEPTED, w] == 0:
+            return
+        rate = scalars[INVERSE_STEP, w]
+        if wp.static(midpoint):
+            rate *= real(0.5)
+        k = centers[b] + w * blocks
+        acceleration[b + w * centers.shape[0]] = (after[k] - before[k]) * rate
+
+    return accelerate

@@ -36,7 +36,8 @@ class RigidBodies:
         struct.y = wp.zeros(worlds * carried, dtype=coupled.vector, device=device)
         struct.derivative = wp.zeros(worlds * carried, dtype=tables.matrix, device=device)
         struct.inertia = wp.zeros_like(self.predicted)
-        struct.force, struct.moment = (wp.zeros(worlds * bodies, dtype=coupled.vector, device=device) for _ in range(2))
+        for name in ("force", "moment", "sum_force", "sum_moment"):
+            setattr(struct, name, wp.zeros(worlds * bodies, dtype=coupled.vector, device=device))
         struct.center = tables.center
         longest = _longest_arcs(coupled.host) if self._touches else np.full(bodies, np.inf)
         self.longest = wp.array(longest, dtype=real, device=device)

@@ -1,7 +1,7 @@
 """Time integration on the device: implicit Euler and implicit midpoint rule, with retries."""
 
 from collections.abc import Iterator, Sequence
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import warp as wp
@@ -31,6 +31,9 @@ from ddg_warp.solve.stepping.world_reset import WorldReset, outcomes
 from ddg_warp.solve.stepping.wrenches import Reactions, Wrenches
 from ddg_warp.timers import timer
 from ddg_warp.typing import Bools, Names, Option, Scheme
+
+if TYPE_CHECKING:
+    from ddg_warp.postprocess.joint_wrenches import JointWrenches
 
 FAILURES = ("raise", "flag")
 SOLVERS = ("newton", "projective")
@@ -513,6 +516,29 @@ class Integrator:
                 "wrenches: they are evaluated within steps; call integrator.watch_wrenches() before the step"
             )
         return self.watched_wrenches.values()
+
+    def joint_wrenches(self, state: State) -> "JointWrenches":
+        """Return the wrench of every joint of rigid bodies on its second body in the last step, about the point of the joint.
+
+        A joint with the world acts on the body. Wrenches hold motors, damping, stops, and the inertia that a pin balances; see
+        `JointWrenches`. By the midpoint rule a pin balances the forces of the middle of the step. Reads from the device.
+
+        Args:
+            state: end of the last step.
+
+        Raises:
+            SceneError: the scene has no joint of rigid bodies, or the state is of another model.
+        """
+        from ddg_warp.postprocess.joint_wrenches import joint_wrenches, pinned_masses, require_joints
+
+        require_joints("joint_wrenches", self.model)
+        check_state("joint_wrenches", self.model, state)
+        struct, shape = self._coupled.newton.rigid_bodies.bodies, (self.model.worlds, -1, 3)
+        arrays = struct.sum_force, struct.sum_moment, self._coupled.bodies.acceleration
+        force, moment, acceleration = (array.numpy().astype(float).reshape(shape) for array in arrays)
+        # the masses of pinned bodies count at their pins, which do not move, with a weight that acts at their centres
+        inertia = pinned_masses(self.model) * (acceleration + np.array(self.model.scene.gravity))
+        return joint_wrenches(self.model, state, force - inertia, moment)
 
     def forget(self) -> None:
         """Reset energy accounts and failed worlds, for a state from outside."""

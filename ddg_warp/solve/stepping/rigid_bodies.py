@@ -11,12 +11,19 @@ class RigidBodyStep:
 
     Args:
         newton: `CoupledNewton`, with its `RigidBodies`.
+
+    Attributes:
+        acceleration: mean accelerations of the centres of mass over the last substep (W B,) [m/s^2].
     """
 
     def __init__(self, newton, midpoint: bool):
         self.newton, self.bodies, self.tables = newton, newton.rigid_bodies, newton.rigid_bodies.tables
         self._pushed = False  # True with wrenches of controls
         self.coupled, real = newton.coupled, newton.coupled.real
+        self.acceleration = wp.zeros(
+            self.coupled.worlds * len(self.tables), dtype=self.coupled.vector, device=self.coupled.device
+        )
+        self._accelerate = motion.accelerate_kernel(real, midpoint)
         self._predict, self._turn = motion.predict_kernel(real, midpoint), motion.turn_kernel(real)
         self._finish, self._depart = motion.finish_kernel(real, midpoint), motion.depart_kernel(real)
 
@@ -24,7 +31,7 @@ class RigidBodyStep:
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         departs = [self._depart] if self.newton.contact else []
-        return [self._predict, self._turn, self._finish, *departs, *self.tables.kernels]
+        return [self._accelerate, self._predict, self._turn, self._finish, *departs, *self.tables.kernels]
 
     def push(self, wrenches: np.ndarray | None) -> None:
         """Set forces at the centres and moments on all bodies (1 or worlds, bodies, 6), none without."""
@@ -74,6 +81,8 @@ class RigidBodyStep:
         inputs += [tables.spins, self.coupled.blocks, *newton.islands.arrays]
         self._launch(self._finish, inputs, [after.rotation, after.momentum, after.q])
         tables.carry(after)
+        inputs = [before.v, after.v, tables.centers, self.coupled.blocks, *newton.islands.arrays]
+        self._launch(self._accelerate, inputs, [self.acceleration])
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:
         wp.launch(kernel, (self.coupled.worlds, len(self.tables)), inputs, outputs, device=self.coupled.device)
