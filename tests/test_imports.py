@@ -19,6 +19,7 @@ LAYERS = (
     "postprocess",
     "adjoint",
     "view",
+    "coupling",
     "run",
     "torch",
     "data",

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ddg_warp import argument_checks
+from ddg_warp.errors import SceneError
 from ddg_warp.typing import Floats, Vector
 
 
@@ -38,6 +39,37 @@ class Grip:
         """Return the row of `Motion.pose` (1, 21) of a grip at rest; the device adds the pose."""
         return np.concatenate([np.zeros(3), np.eye(3).ravel(), self.pivot, np.zeros(6)])[None]
 
+    def at(self, position, quaternion=(1.0, 0.0, 0.0, 0.0), near=None) -> np.ndarray:
+        """Return the pose (..., 6) with the pivot at a position (..., 3) [m], rotated from rest by a quaternion (..., 4).
+
+        Args:
+            position: of the pivot (..., 3) [m].
+            quaternion: unit quaternion (w, x, y, z) relative to rest.
+            near: earlier pose (..., 6), whose number of turns is kept: rotation vectors of a continuous rotation are continuous. By
+                default rotation vectors are at most pi long.
+
+        Raises:
+            SceneError: a shape does not fit, or a quaternion is not of unit length to 1e-3.
+        """
+        from scipy.spatial.transform import Rotation
+
+        position = argument_checks.array("Grip.at: position", position, "give (..., 3) [m]")
+        quaternion = argument_checks.array("Grip.at: quaternion", quaternion, "give (..., 4), as (w, x, y, z)")
+        for name, values, size in (("position", position, 3), ("quaternion", quaternion, 4)):
+            if values.shape[-1:] != (size,) or not np.isfinite(values).all():
+                raise SceneError(f"Grip.at: {name} has shape {values.shape}; give finite numbers (..., {size})")
+        if (np.abs(np.linalg.norm(quaternion, axis=-1) - 1.0) > 1e-3).any():
+            raise SceneError("Grip.at: the quaternion is not of unit length; give (w, x, y, z) over its length")
+        rotation = Rotation.from_quat(np.roll(quaternion, -1, axis=-1).reshape(-1, 4)).as_rotvec()
+        rotation = rotation.reshape(*quaternion.shape[:-1], 3)
+        shape = np.broadcast_shapes(position.shape[:-1], rotation.shape[:-1])
+        if near is not None:
+            near = argument_checks.broadcast("Grip.at: near", near, (*shape, 6), own=1)
+            rotation = _nearest_turn(np.broadcast_to(rotation, (*shape, 3)), near[..., 3:])
+        pose = np.empty((*shape, 6))
+        pose[..., :3], pose[..., 3:] = position - self.pivot, rotation
+        return pose
+
     def jump(self, t0: float, t1: float) -> None:
         """Return None: a grip never jumps within a step."""
         return None
@@ -47,3 +79,14 @@ class Grip:
         from scipy.spatial.transform import Rotation
 
         return np.einsum("wij,nj->wni", Rotation.from_rotvec(poses[:, 3:]).as_matrix(), vectors)
+
+
+def _nearest_turn(rotation: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Return the rotation vectors (..., 3) of the same orientations that are nearest to others (..., 3)."""
+    angle = np.linalg.norm(rotation, axis=-1, keepdims=True)
+    length = np.linalg.norm(near, axis=-1, keepdims=True)
+    axis = np.where(
+        angle > 0.0, rotation / np.where(angle > 0.0, angle, 1.0), near / np.where(length > 0.0, length, 1.0)
+    )
+    turns = np.rint(((near * axis).sum(-1, keepdims=True) - angle) / (2.0 * np.pi))
+    return axis * (angle + 2.0 * np.pi * turns)
