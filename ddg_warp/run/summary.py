@@ -14,7 +14,7 @@ from pathlib import Path
 from ddg_warp.run.run_directory import system_error
 
 BLANK = ("measured", "reference", "error", "tolerance")
-PACKAGES = ("ddg-warp", "warp-lang", "numpy", "scipy", "h5py", "usd-core", "matplotlib", "torch")
+PACKAGES = ("ddg-warp", "warp-lang", "numpy", "scipy", "h5py", "usd-core", "matplotlib", "torch", "mujoco")
 
 
 def summary(scene: str, parameters: Mapping, result, checks: Iterable) -> dict:
