@@ -13,6 +13,7 @@ Loops: `Integrator`, `AdaptiveStepper`, `statics`, `continuation`, `stability`.
 Query it: `Model`, `State`, `quantities`.
 Geometry, files: `meshes`, `rest_shapes`, `io`, `read_mesh`, `read_curves`.
 Learn: `Simulator` (torch), `ddg_warp.torch`, `ddg_warp.data`, `ddg_warp.rl`.
+Robots: `ddg_warp.coupling` (MuJoCo).
 Errors: `SceneError`, `SolverError`, `SceneWarning`.
 
 Names are loaded on first use, so importing the package loads neither Warp nor other heavy modules. Warp is silent about its modules

@@ -29,6 +29,7 @@ OPTIONAL = {
     "jax": "import jax",
     "pandas": "import pandas",
     "pyvista": "ddg.movie",
+    "mujoco": "ddg.coupling",
 }  # packages, and text of the examples that need them
 MISSING = [name for name in OPTIONAL if importlib.util.find_spec(name) is None]
 RUN_PAGES = """

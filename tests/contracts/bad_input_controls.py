@@ -84,6 +84,9 @@ refuse("Controls", {
     "gravity out of the plane": (lambda: _apply(_gripped(2), gravity=(0.0, 1.0, 0.0)), "gravity", "0 along y"),
     "gravity across the axis": (lambda: _apply(_gripped_dome(), gravity=(1.0, 0.0, 0.0)), "gravity", "0 along x and y"),
 })
+each("Grip", "position", ["there", None, (NAN, 0, 0), (0, 0)], lambda v: ddg.Grip().at(v), "Grip.at: position")
+each("Grip", "quaternion", ["up", (1, 0, 0), (NAN, 0, 0, 0), (2, 0, 0, 0)], lambda v: ddg.Grip().at((0, 0, 0), v), "quaternion")
+each("Grip", "near", ["there", (0, 0, 0), 3], lambda v: ddg.Grip().at((0, 0, 0), near=v), "Grip.at: near")
 each("Grip", "pivot", [1.0, (0.0, 1.0), "there", (NAN, 0.0, 0.0)], ddg.Grip, "Grip: pivot", "three finite")
 refuse("Grip", {
     "of a plane of symmetry": (_symmetry, "symmetry", "does not rotate", "Motion(translation"),

@@ -332,6 +332,12 @@ POSE = ddg.Controls(poses=[[0.1, 0.0, 0.0, 0.0, 0.1, 0.0]])
 CALLS["Grip"] = Call(ddg.Grip, lambda **named: observe_motion(ddg.Grip(**named), POSE), {}, {"pivot": (0, 0, 1)})
 
 
+HALF_TURN, FULL_TURN = (0.0, 0.0, 0.0, 1.0), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 6.0])
+CALLS["Grip.at"] = Call(ddg.Grip.at, lambda **named: ddg.Grip().at(**named), {"position": (0, 0, 1)}, {
+    "position": (0, 1, 0), "quaternion": HALF_TURN,
+    "near": Change(FULL_TURN, {"quaternion": (np.cos(0.1), 0.0, 0.0, -np.sin(0.1))})})  # fmt: skip
+
+
 # --- fields ---
 CURL = {"name": "curl", "parameter": "rod_bend_twist.rest_1", "values": 1.0}
 scene_call("prescribe", CURL, {

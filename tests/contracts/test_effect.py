@@ -3,6 +3,7 @@
 All rows take 25 s of one core.
 """
 
+import importlib.util
 import inspect
 from collections import defaultdict
 from functools import cache
@@ -14,6 +15,9 @@ import pytest
 from effects import CALLS, Change, observed
 
 import ddg_warp as ddg
+
+if importlib.util.find_spec("mujoco"):
+    import effects_of_coupling  # noqa: F401
 
 LONG = {
     ("Stop at limit points", "limit_points"),
