@@ -29,8 +29,8 @@ class MuJoCo:
     over the step, and the wrenches of the grips become the wrenches of the next step. Bodies of MuJoCo do not include the masses of the
     nodes that a grip holds: these arrive with the wrenches.
 
-    The scheme is of first order in the step. Without iterations it is stable as long as a link is heavier than the part of the rod
-    that bending waves reach in a step. With iterations it is stable for light links, too.
+    The scheme is of first order in the step. Without iterations it is stable as long as a link is heavier than the length of rod that
+    bending waves reach in a step. With iterations it is stable for light links, too.
 
     Measured: a hinged link that holds a rod of 20 edges converges with the step like the monolithic solution, with and without damping.
     It does so without iterations for links of 0.5 to 2.2 times the mass of the rod at 1 to 8 ms, and of 0.2 times at 1 and 2 ms. With
@@ -43,7 +43,7 @@ class MuJoCo:
             rigidly with the body that carries the named object.
         data: `MjData` of the start, copied; the initial configuration by default.
         state: start of the model; the initial state by default.
-        control: function of `MjData`, called before each step of MuJoCo, which sets `ctrl`.
+        control: function of `MjData`, called before each step of MuJoCo, also of repeated ones, to set `ctrl`.
         iterations: largest number of repetitions of a step until wrenches agree with poses to 1e-4, for light links; 1 does not repeat.
         options: of the `Integrator`.
 

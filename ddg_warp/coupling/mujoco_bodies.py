@@ -17,7 +17,7 @@ class MuJoCoBodies:
     """Handles of bodies and joints that `add_bodies` added, by MuJoCo's names.
 
     Attributes:
-        bodies: rigid bodies; bodies that MuJoCo welds together share one handle.
+        bodies: rigid bodies; bodies that MuJoCo welds together have one handle.
         joints: hinges and balls, and constraints `connect` and `weld`.
     """
 
@@ -41,8 +41,8 @@ def add_bodies(scene, mj_model, *, data=None, ctrl: Mapping[str, float | Callabl
             range, times gain and gear.
 
     Raises:
-        SceneError: the model has slides, several joints of a body, springs, armature or friction of joints, actuators other than motors
-            of hinges, tendons, height fields or others; the message lists all of them.
+        SceneError: the model has features that rigid bodies lack; the message lists all of them. Examples are slides, several joints of
+            a body, springs, armature or friction of joints, actuators other than motors of hinges, and tendons.
         MissingMuJoCoError: the package mujoco is missing.
     """
     call = "add_bodies"

@@ -31,7 +31,7 @@ def unsupported(mj_model, geom: int) -> str:
 
 
 def shape_of(mj_model, data, geom: int) -> Plane | Sphere | Capsule | Mesh:
-    """Return the shape of a geom at its pose; ellipsoids and cylinders are meshes inscribed in them."""
+    """Return the shape of a geom at the pose in the data; ellipsoids and cylinders become inscribed meshes."""
     kinds = mujoco_module().mjtGeom
     kind, size = kinds(mj_model.geom_type[geom]), mj_model.geom_size[geom]
     center, rotation = data.geom_xpos[geom].copy(), data.geom_xmat[geom].reshape(3, 3).copy()

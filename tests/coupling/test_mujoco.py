@@ -210,15 +210,17 @@ def test_urdf(mujoco, tmp_path):
 
 
 def test_free_bodies_balls_and_constraints(mujoco):
-    """A free body that moves, with a ball on it, keeps its velocity; `connect` becomes a ball."""
+    """A free body that moves, with a ball on it, keeps its velocity; constraints become joints."""
     xml = """<mujoco><option gravity="0 0 0"/><worldbody><geom type="plane" size="1 1 1"/>
         <body name="hull" pos="0 0 1"><freejoint/><geom type="ellipsoid" size="0.1 0.2 0.3" mass="1"/>
         <body name="mast" pos="0 0 0.4"><joint name="foot" type="ball"/><geom type="cylinder" size="0.02 0.1" mass="0.1"/></body></body>
-        <body name="buoy" pos="0.5 0 1"><freejoint/><geom size="0.1" mass="1"/></body></worldbody>
-        <equality><connect name="line" body1="hull" body2="buoy" anchor="0.25 0 0"/></equality></mujoco>"""
+        <body name="buoy" pos="0.5 0 1"><freejoint/><geom size="0.1" mass="1"/></body>
+        <body name="float" pos="-0.5 0 1"><freejoint/><geom size="0.1" mass="1"/></body></worldbody>
+        <equality><connect name="line" body1="hull" body2="buoy" anchor="0.25 0 0"/>
+        <weld name="bar" body1="hull" body2="float"/></equality></mujoco>"""
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
-    for start in (0, model.nv - 6):  # dofs of the free joints
+    for start in (0, model.nv - 12, model.nv - 6):  # dofs of the free joints
         data.qvel[start : start + 3] = 0.1, 0.0, 0.2
     mujoco.mj_forward(model, data)
     scene = ddg.Scene(gravity=(0, 0, 0))
@@ -226,11 +228,12 @@ def test_free_bodies_balls_and_constraints(mujoco):
     assert {name: scene.body_joints[handle].call for name, handle in added.joints.items()} == {
         "foot": "ball",
         "line": "ball",
+        "bar": "weld",
     }
     built = scene.build(device="cpu")
     integrator, state = ddg.Integrator(built), built.state()
     for _ in range(10):
         state = integrator.step(state, 0.01)
-    for name in ("hull", "mast", "buoy"):
+    for name in ("hull", "mast", "buoy", "float"):
         expected = data.body(name).xipos + 0.1 * np.array([0.1, 0.0, 0.2])
         assert state.body(added.bodies[name]).position == pytest.approx(expected, abs=1e-9)
