@@ -1,6 +1,7 @@
 """Staggered co-simulation of rods and shells with a robot in MuJoCo, by grips and wrenches."""
 
 from collections.abc import Callable, Iterator, Mapping
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -89,7 +90,7 @@ class MuJoCo:
         self._owners = [(i, grips[id(s.motion)]) for i, s in enumerate(supports) if id(s.motion) in grips]
         self.integrator = Integrator(model, **options)
         self.integrator.watch_wrenches()
-        self.data = self._mujoco.MjData(self.mj_model)
+        self.data = copy(self._start[0])
         self.reset()
 
     def __repr__(self) -> str:
@@ -98,7 +99,8 @@ class MuJoCo:
     def reset(self) -> State:
         """Return to the start of both models; return its state."""
         start, self.state = self._start
-        self._mujoco.mj_copyData(self.data, self.mj_model, start)
+        self._restore(self._saved(start))
+        self._mujoco.mj_forward(self.mj_model, self.data)
         self.reactions: Reactions = self.model.reactions(self.state)
         self._wrenches = self._reversed()
         return self.state
@@ -117,13 +119,10 @@ class MuJoCo:
         substeps = self._substeps(dt)
         controls = Controls() if controls is None else controls
         poses = self.state.poses() if controls.poses is None else np.array(controls.poses, float).reshape(-1, 6)
-        physics = self._mujoco.mjtState.mjSTATE_INTEGRATION
-        before = np.zeros(self._mujoco.mj_stateSize(self.mj_model, physics))
-        self._mujoco.mj_getState(self.mj_model, self.data, before, physics)
-        applied, tried = self._wrenches, []
+        before, applied, tried = self._saved(self.data), self._wrenches, []
         for iteration in range(self.iterations):
             if iteration:
-                self._mujoco.mj_setState(self.mj_model, self.data, before, physics)
+                self._restore(before)
             self.data.xfrc_applied[self._rows] = applied
             for _ in range(substeps):
                 if self.control is not None:
@@ -156,6 +155,17 @@ class MuJoCo:
                 f"coupling.MuJoCo: dt = {dt:g} s is no multiple of MuJoCo's time step, {timestep:g} s; give one, or set opt.timestep"
             )
         return substeps
+
+    def _saved(self, data) -> np.ndarray:
+        """Return all variables of MuJoCo's data that the next step depends on."""
+        variables = self._mujoco.mjtState.mjSTATE_INTEGRATION
+        values = np.zeros(self._mujoco.mj_stateSize(self.mj_model, variables))
+        self._mujoco.mj_getState(self.mj_model, data, values, variables)
+        return values
+
+    def _restore(self, values: np.ndarray) -> None:
+        """Set MuJoCo's data to saved variables."""
+        self._mujoco.mj_setState(self.mj_model, self.data, values, self._mujoco.mjtState.mjSTATE_INTEGRATION)
 
     def _reversed(self) -> np.ndarray:
         """Return force and moment about the centre of mass of the model on each attached body (bodies, 6)."""

@@ -1,5 +1,6 @@
 """MuJoCo models: compilation of MJCF and URDF, and names."""
 
+from copy import copy
 from pathlib import Path
 
 import numpy as np
@@ -55,15 +56,14 @@ def compiled(call: str, source):
 def start_data(call: str, mj_model, data=None):
     """Return a copy of MuJoCo's data, by default of the initial configuration, with all poses computed."""
     mujoco = mujoco_module()
-    result = mujoco.MjData(mj_model)
     if data is not None:
         if not isinstance(data, mujoco.MjData):
             raise SceneError(f"{call}: data are {argument_checks.shown(data)}; give an MjData of the MuJoCo model")
-        if data.qpos.shape != result.qpos.shape:
+        if data.qpos.size != mj_model.nq:
             raise SceneError(
                 f"{call}: data have {data.qpos.size} coordinates and the model {mj_model.nq}; give data of this MuJoCo model"
             )
-        mujoco.mj_copyData(result, mj_model, data)
+    result = mujoco.MjData(mj_model) if data is None else copy(data)
     mujoco.mj_forward(mj_model, result)
     return result
 
