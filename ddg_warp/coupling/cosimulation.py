@@ -9,7 +9,7 @@ import numpy as np
 from ddg_warp import argument_checks
 from ddg_warp.coupling.mujoco_model import body_of, compiled, mujoco_module, start_data
 from ddg_warp.errors import SceneError
-from ddg_warp.model.controls import Controls
+from ddg_warp.model.controls import Controls, checked
 from ddg_warp.model.model import check_model
 from ddg_warp.model.state import State, check_state
 from ddg_warp.scene.grip import Grip
@@ -38,12 +38,12 @@ class MuJoCo:
     iterations links of 0.02 times the mass converge at 1 to 8 ms, by 4 iterations a step at 1 ms, and 15 at 8 ms.
 
     Args:
-        model: of one world, at rest where MuJoCo's bodies are in `data`.
+        model: of one world.
         mj_model: `MjModel`, or path or text of an MJCF or URDF file.
         attach: names of bodies, sites or geoms of MuJoCo, by `Grip` or by the name of a support or obstacle with a `Grip`. A grip moves
             rigidly with the body that carries the named object.
         data: `MjData` of the start, copied; the initial configuration by default.
-        state: start of the model; the initial state by default.
+        state: start of the model, with its grips where MuJoCo's bodies are in `data`; the initial state by default.
         control: function of `MjData`, called before each step of MuJoCo, also of repeated ones, to set `ctrl`.
         iterations: largest number of repetitions of a step until wrenches agree with poses to 1e-4, for light links; 1 does not repeat.
         options: of the `Integrator`.
@@ -88,6 +88,7 @@ class MuJoCo:
         grips = {id(model.grips[index]): body for index, body in self._bodies.items()}
         self._rows = sorted(set(self._bodies.values()))
         self._owners = [(i, grips[id(s.motion)]) for i, s in enumerate(supports) if id(s.motion) in grips]
+        self._first = self._start[1].poses()  # of grips at the start
         self.integrator = Integrator(model, **options)
         self.integrator.watch_wrenches()
         self.data = copy(self._start[0])
@@ -118,7 +119,7 @@ class MuJoCo:
         """
         substeps = self._substeps(dt)
         controls = Controls() if controls is None else controls
-        poses = self.state.poses() if controls.poses is None else np.array(controls.poses, float).reshape(-1, 6)
+        poses = self.state.poses() if controls.poses is None else checked(controls, self.model)["poses"][0]
         before, applied, tried = self._saved(self.data), self._wrenches, []
         for iteration in range(self.iterations):
             if iteration:
@@ -181,10 +182,12 @@ class MuJoCo:
         poses, before, start = poses.copy(), self.state.poses(), self._start[0]
         turn, inverse, arm = np.zeros(4), np.zeros(4), np.zeros(3)
         for index, body in self._bodies.items():
-            grip = self.model.grips[index]
+            grip, first, rotation = self.model.grips[index], self._first[index], np.array([1.0, 0.0, 0.0, 0.0])
             self._mujoco.mju_negQuat(inverse, start.xquat[body])
             self._mujoco.mju_mulQuat(turn, self.data.xquat[body], inverse)
-            self._mujoco.mju_rotVecQuat(arm, np.array(grip.pivot) - start.xpos[body], turn)
+            self._mujoco.mju_rotVecQuat(arm, first[:3] + grip.pivot - start.xpos[body], turn)
+            self._mujoco.mju_quatIntegrate(rotation, first[3:], 1.0)
+            self._mujoco.mju_mulQuat(turn, turn.copy(), rotation)
             poses[index] = grip.at(self.data.xpos[body] + arm, turn, near=before[index])
         return poses
 

@@ -84,6 +84,9 @@ def test_weight_of_a_cable_arrives_at_the_joint(mujoco):
     angle = sim.data.qpos[0]
     assert angle == pytest.approx(ROD * GRAVITY * arm * np.cos(angle) / stiffness, rel=1e-3)
     assert sim.state.points()[0] == pytest.approx(sim.data.site("tip").xpos, abs=1e-12)
+    again = ddg.coupling.MuJoCo(sim.model, xml, {"hand": "tip"}, data=sim.data, state=sim.state)
+    again.step(5e-3)
+    assert again.state.points() == pytest.approx(sim.step(5e-3).points(), abs=1e-9)
     start = sim.reset()
     assert (start.time, sim.data.time, sim.data.qpos[0]) == (0.0, 0.0, 0.0)
 
