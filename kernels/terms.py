@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, POINT_PLANE, POINT_TRIANGLE, Kind
+from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, POINT_PLANE, POINT_POINT, POINT_TRIANGLE, Kind
 from ddg_warp.kernels.densities import POSITIVE, Density, Parameter
 from ddg_warp.kernels.densities.contact import log_barrier, smooth_penalty
 from ddg_warp.kernels.densities.dipole import dipole_dipole, dipole_in_field
@@ -200,6 +200,7 @@ JOINTS = {
         Term("hinge", hinge, hinge_law, "hinges, motors and welds of rigid bodies, stiffness"),
     )
 }
+BODY_JOINTS = "ball_joint", "hinge"  # terms whose elements belong to joints of rigid bodies
 GLUE = Term("glued_edge", rod_surface_angle, quadratic, "what turns the edges of an attached rod with the shell")
 
 MAGNETS = {
@@ -217,6 +218,7 @@ _COLLISIONS = {
     "point_triangle": (POINT_TRIANGLE, "a point and a triangle"),
     "edge_point": (EDGE_POINT, "an edge and a ball"),
     "point_plane": (POINT_PLANE, "a point and a half-space"),
+    "point_point": (POINT_POINT, "two balls"),
 }
 LAWS = {"barrier": log_barrier, "penalty": smooth_penalty}
 FRICTION_LAWS = {"logistic": logistic_friction, "polynomial": polynomial_friction}

@@ -37,18 +37,18 @@ def rods_of(model) -> int:
 
 
 def mass(model) -> float:
-    """Return the mass of all rods and shells [kg]."""
-    return float(_masses(model).sum())
+    """Return the mass of all rods, shells and rigid bodies [kg]."""
+    return float(masses(model).sum())
 
 
 def momentum(model, state) -> np.ndarray:
-    """Return the momentum (3,) of all rods and shells [N s]."""
-    each = _masses(model)
+    """Return the momentum (3,) of all rods, shells and rigid bodies [N s]."""
+    each = masses(model)
     return each @ state.coupled.v.numpy()[: len(each)].astype(float)
 
 
 def weight(model) -> float:
-    """Return the weight of all rods and shells [N]."""
+    """Return the weight of all rods, shells and rigid bodies [N]."""
     return float(mass(model) * np.linalg.norm(model.scene.gravity))
 
 
@@ -100,11 +100,12 @@ def colors(model) -> np.ndarray:
     return np.random.default_rng(1).uniform(0.1, 0.85, (rods_of(model), 3))
 
 
-def _masses(model) -> np.ndarray:
-    """Return masses of the nodes of the coupled system [kg], without obstacle nodes."""
+def masses(model) -> np.ndarray:
+    """Return masses of the nodes of the coupled system [kg], zero for obstacles."""
     host = model.coupled.host
-    first = min((int(nodes.min()) for nodes in host.obstacles), default=host.nodes)
-    return host.mass[:first, 0]
+    result = host.mass[: host.nodes, 0].copy()
+    result[np.concatenate([np.zeros(0, int), *host.obstacles, *host.markers])] = 0.0
+    return result
 
 
 def kept_apart(result, refused: int = 0) -> list[ddg.Check]:

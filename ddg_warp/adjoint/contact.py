@@ -63,8 +63,8 @@ class ContactAdjoint:
         self._direct = contact_parameters.direction_kernels(real) if any(leads) else ()
         direction_nodes = search.shapes.beside
         self._leads = [
-            self._led(direction_nodes(kind.first)) if has_directions else None
-            for kind, has_directions in zip(kinds, leads, strict=False)
+            self._led(direction_nodes(pairs.first.size)) if has_directions else None
+            for pairs, has_directions in zip(search.lists, leads, strict=False)
         ]
         self._sides = [contact_parameters.side_kernels(kind, real) for kind in kinds]
         self._group, self._bodies = contact_parameters.group_kernels(real), contact_parameters.body_kernel(real)

@@ -74,7 +74,8 @@ def extend(group: h5py.Group, name: str, rows: np.ndarray, block: int, dtype=np.
     if name not in group:
         row_bytes = max(8, 8 * int(np.prod(rows.shape[1:])))
         chunk = 1 << int(np.log2(max(1, min(block, CHUNK_BYTES // row_bytes))))
-        options = {"maxshape": (None, *rows.shape[1:]), "chunks": (chunk, *rows.shape[1:])}
+        options = {"maxshape": (None, *(size or None for size in rows.shape[1:]))}  # a scene may have no rod
+        options["chunks"] = (chunk, *(max(1, size) for size in rows.shape[1:]))
         options["fletcher32"] = True
         group.create_dataset(name, shape=(0, *rows.shape[1:]), dtype=dtype, **options)
     dataset = group[name]

@@ -111,6 +111,8 @@ def contact_potentials(contact_parameters) -> list[Potential]:
     law, kinds = contact_parameters.law, {body.kind for body in contact_parameters.bodies}
     optional = ((MESH, "point_triangle"), (BALL, "edge_point"), (PLANE, "point_plane"))
     pairs = ["edge_edge", *(name for kind, name in optional if kind in kinds)]
+    balls = [body.still for body in contact_parameters.bodies if body.kind == BALL]
+    pairs += ["point_point"] * (len(balls) > 1 and not all(balls))
     friction = [FRICTION[f"friction_{law.friction_law}_{pair}"] for pair in pairs if contact_parameters.has_friction]
     return [*(contact_potential(law.name, contact_parameters.density, pair) for pair in pairs), *friction]
 

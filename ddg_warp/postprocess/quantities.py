@@ -6,7 +6,7 @@ import numpy as np
 
 from ddg_warp import argument_checks, device_arrays
 from ddg_warp.capture_lock import launches
-from ddg_warp.kernels.terms import AXISYMMETRIC, MAGNETS, SHELLS
+from ddg_warp.kernels.terms import AXISYMMETRIC, BODY_JOINTS, MAGNETS, SHELLS
 from ddg_warp.model.model import Model, check_model
 from ddg_warp.model.rigid_bodies import body_energies
 from ddg_warp.model.state import State, query
@@ -161,6 +161,9 @@ def stresses(model: Model, state: State) -> Stresses:
     ends, which are included, the directors of the clamp. Moments next to rigid joints are in "rigid_joint", about the directors of
     the rod at the joint. Moments per length [N] of edges glued to a shell are in "glued_edge".
 
+    Joints of rigid bodies: forces [N] at their points are in "ball_joint" and "hinge", the latter with moments [N m] about both
+    normals of the axis and about it.
+
     Shells: second Piola-Kirchhoff stress of triangles, components (11, 22, 12) along the first edge at rest and across. Forces per
     length [N/m] are in "shell_stretch", moments per length [N] in "shell_bend" and "shell_bend_dof". A moment is positive if it
     raises the second fundamental form. Hinges have moments per weight.
@@ -258,6 +261,8 @@ def _add_coupled_stresses(model, state, index: int, result: dict[str, list]) -> 
         scene.shells if term.name in SHELLS else scene.axisymmetric_shells if term.name in AXISYMMETRIC else None
     )
     count = scene.rod_count if of_shells is None else len(of_shells)
+    if term.name in BODY_JOINTS:
+        count = len(scene.body_joints)
     owners = result.setdefault(term.name, [None] * count)
     for owner in np.unique(part.host.owner[0]):
         owners[owner] = _each_world(values[:, part.host.owner[0] == owner])

@@ -230,7 +230,7 @@ def _add_joints(model, state, rod: int, ends: np.ndarray) -> None:
     coupled, worlds = model.coupled, model.worlds
     for index, part in enumerate(coupled.sets):
         of_rod = part.host.owner[0] == rod
-        if not part.term.measure.spins or not of_rod.any():
+        if part.term.name != "rigid_joint" or not of_rod.any():
             continue
         host, measure, k = coupled.host, part.term.measure, part.host.owner[1, of_rod]
         edges = part.host.slots[measure.nodes][of_rod] - host.nodes

@@ -23,13 +23,14 @@ from ddg_warp.kernels.collision.contact.pair_evaluation import (
 )
 from ddg_warp.kernels.collision.contact.potential import ENDS, rows_of
 from ddg_warp.kernels.collision.friction.potential import ROWS, friction_kernel, lag_kernel, lagged_struct
-from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, sides_struct
+from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, POINT_POINT, sides_struct
 from ddg_warp.kernels.terms import LAWS, Potential
 from ddg_warp.run.derivative_samples import Sample, random_parameters
 
 CROSSING = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.3, -0.5, 0.3], [0.7, 0.5, 0.4]]
 OBLIQUE = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.1, 0.1, 0.4], [0.9, 0.5, 0.3]]  # mollified, by `SQUARE`
 ABOVE = [[0.3, 0.3, 0.4], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+APART = [[0.0, 0.0, 0.0], [0.3, 0.2, 0.4]]
 OFFSET = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.4, 0.3, 0.3]]
 SQUARE = 30.0  # squared rest length of both edges
 INNER = 0.5, 0.0  # one node in the interior of a rod, one at an end
@@ -59,7 +60,7 @@ class ContactSample(Sample):
     def random_state(self) -> dict[str, np.ndarray]:
         """Return random data; see the class."""
         random, kind = np.random.default_rng(11), self.collision
-        base = np.array(OFFSET if kind == EDGE_POINT else CROSSING if kind == EDGES else ABOVE)
+        base = np.array({EDGE_POINT: OFFSET, EDGES: CROSSING, POINT_POINT: APART}.get(kind, ABOVE))
         nodes = np.repeat(base[:, None], self.COUNT, 1)
         if kind == EDGES:
             nodes[:, ::2] = np.array(OBLIQUE)[:, None]

@@ -103,7 +103,7 @@ def rods_picture(
     times = np.array([time for time, _ in frames])
     points = np.array([np.reshape(shape, (-1, 3)) for _, shape in frames], dtype=np.float64)
     surfaces = getattr(rods, "surfaces", None)
-    worlds = points.shape[1] // Shapes.of(curves, surfaces).point_count
+    worlds = points.shape[1] // max(1, Shapes.of(curves, surfaces).point_count)
     shapes = Shapes.of(curves, surfaces, worlds)
     shown = [(time, body, body is obstacles) for body in (bodies, obstacles) for time in (body or {}) if time in times]
     shown = [(time, *each[time], closed) for time, each, closed in shown]

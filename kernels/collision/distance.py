@@ -14,9 +14,10 @@ import warp as wp
 
 @cache
 def distance_functions(real):
-    """Return the device functions `segments`, `point_triangle`, `edge_point` and `point_plane`.
+    """Return the device functions `segments`, `point_triangle`, `edge_point`, `point_plane` and `point_point`.
 
-    `segments(a0, a1, b0, b1) -> (r, w)`, `point_triangle(p, a, b, c)`, `edge_point(a, b, p, unused)`: positions may coincide.
+    `segments(a0, a1, b0, b1) -> (r, w)`, `point_triangle(p, a, b, c)`, `edge_point(a, b, p, unused)`,
+    `point_point(p, a, unused, unused)`: positions may coincide.
     `point_plane(p, a, b, c)`: offset from the half-space behind the plane, zero inside of it.
     """
     X, W = wp.types.vector(3, real), wp.types.vector(4, real)
@@ -79,4 +80,9 @@ def distance_functions(real):
         at_b, at_c = wp.dot(wp.cross(w, v), n) / square, wp.dot(wp.cross(u, w), n) / square
         return wp.max(wp.dot(w, n), real(0.0)) / square * n, W(real(1.0), at_b + at_c - real(1.0), -at_b, -at_c)
 
-    return segments, point_triangle, edge_point, point_plane
+    @wp.func
+    def point_point(p: X, a: X, unused: X, repeated: X):
+        """Return the offset from point a to point p, and weights."""
+        return p - a, W(real(1.0), real(-1.0), real(0.0), real(0.0))
+
+    return segments, point_triangle, edge_point, point_plane, point_point

@@ -2,8 +2,8 @@
 
 Two piecewise linear surfaces first meet where an edge meets an edge or a point meets a triangle. So edges are paired with edges and
 points with triangles. Edges of rods and of triangles are one list; nodes of rods are among the points. Balls are points with their own
-radius, which are paired with edges of rods and, as all points, with triangles. Half-spaces are paired with points alone. Indices of
-primitives and nodes count all worlds, one after the other, each alike.
+radius, which are paired with edges of rods, with each other and, as all points, with triangles. Half-spaces are paired with points
+alone. Indices of primitives and nodes count all worlds, one after the other, each alike.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,13 @@ class Kind:
         return self.first == self.second
 
 
-EDGES, POINT_TRIANGLE, EDGE_POINT, POINT_PLANE = Kind(2, 2), Kind(1, 3), Kind(2, 1), Kind(1, 3, True)
+EDGES, POINT_TRIANGLE, EDGE_POINT, POINT_PLANE, POINT_POINT = KINDS = (
+    Kind(2, 2),
+    Kind(1, 3),
+    Kind(2, 1),
+    Kind(1, 3, True),
+    Kind(1, 1),
+)
 
 
 @cache
@@ -105,7 +111,7 @@ def pair_functions(kind: Kind, real):
     Sides, N, Y = sides_struct(real), wp.types.vector(4, int), wp.types.matrix((4, 3), real)
     S, count = wp.types.vector(4, real), kind.first
     used = kind.first + kind.second
-    measure = dict(zip((EDGES, POINT_TRIANGLE, EDGE_POINT, POINT_PLANE), distance_functions(real), strict=True))[kind]
+    measure = dict(zip(KINDS, distance_functions(real), strict=True))[kind]
 
     @wp.func
     def pair_nodes(sides: Sides, i: int, j: int, w: int):
@@ -141,7 +147,7 @@ def pair_functions(kind: Kind, real):
         if wp.static(kind == EDGE_POINT):
             if sides.first.span[i][3] < real(0.0):
                 return False
-        if wp.static(kind.alike):
+        if wp.static(kind == EDGES):
             if a == b and within(sides.first.span[i], sides.second.span[j]):
                 return False
         if sides.ignored.shape[0] > 0:

@@ -20,6 +20,7 @@ KINDS = {
     "edge_edge": edge_edge,
     "point_triangle": point_triangle,
     "edge_point": lambda a, b, p: point_edge(p, a, b),
+    "point_point": lambda a, b: np.linalg.norm(a - b, axis=-1),
 }
 
 
@@ -51,6 +52,10 @@ def positions(name: str, family: str) -> np.ndarray:
         return np.einsum("nij,kni->knj", turn, np.stack([-0.5 * e, 0.5 * e, shift - 0.5 * f, shift + 0.5 * f]))
     if name == "edge_edge":
         return random.normal(size=(4, COUNT, 3)) + np.array([0.5, 0.5, 0.0, 0.0])[:, None, None] * [1.0, 0.0, 0.0]
+    if name == "point_point":
+        apart = 0.01 if family == "touching" else 1.0
+        first = random.normal(size=(COUNT, 3))
+        return np.stack([first, first + apart * random.normal(size=(COUNT, 3))])
     corners = RIGHT[: 3 if name == "point_triangle" else 2, None] + 0.2 * random.normal(size=(1, COUNT, 3))
     if family == "touching":
         share = random.dirichlet(np.full(len(corners), 3.0), COUNT).T
@@ -133,6 +138,8 @@ def test_centres_that_meet_have_no_direction(device, name):
         nodes[2:] += 0.5 * (nodes[0] + nodes[1] - nodes[2] - nodes[3])
     elif name == "edge_point":
         nodes[2] = nodes[:2].mean(0)
+    elif name == "point_point":
+        nodes[1] = nodes[0]
     else:
         nodes[0] = nodes[1:].mean(0)
     assert measured(name, nodes, device)[1].max() < 1e-15

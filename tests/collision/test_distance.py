@@ -6,15 +6,16 @@ import pytest
 import warp as wp
 
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import corners_function
-from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, POINT_TRIANGLE, pair_functions
+from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, POINT_POINT, POINT_TRIANGLE, pair_functions
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 
 KINDS = {
     "edges": (EDGES, brute_force.edge_edge),
     "point and triangle": (POINT_TRIANGLE, brute_force.point_triangle),
     "edge and point": (EDGE_POINT, lambda a, b, p, _: brute_force.point_edge(p, a, b)),
+    "two points": (POINT_POINT, lambda a, b, *_: np.linalg.norm(a - b, axis=-1)),
 }
-REGIONS = {"edges": 9, "point and triangle": 7, "edge and point": 3}
+REGIONS = {"edges": 9, "point and triangle": 7, "edge and point": 3, "two points": 1}
 
 
 def closest_points(kind, corners: np.ndarray, device: str, real=wp.float64) -> tuple[np.ndarray, np.ndarray]:

@@ -16,10 +16,18 @@ from ddg_warp.run.scene_registry import load_file
 DAILY = {
     *("rod_stretch_damped", "rod_bend_twist", "planar_bend"),
     *("shell_stretch_damped", "shell_stretch_curved", "shell_hinge_damped", "shell_tilt", "shell_isometric"),
-    *("axisymmetric_stretch", "axisymmetric_bend", "axisymmetric_rim", "rigid_joint", "glued_edge"),
+    *(
+        "axisymmetric_stretch",
+        "axisymmetric_bend",
+        "axisymmetric_rim",
+        "rigid_joint",
+        "glued_edge",
+        "ball_joint",
+        "hinge",
+    ),
     *("penalty_edge_edge", "penalty_edge_point", "penalty_point_plane", "barrier_edge_edge", "barrier_point_triangle"),
     *("friction_logistic_edge_edge", "friction_polynomial_edge_point", "friction_logistic_point_triangle"),
-    "friction_logistic_point_plane",
+    *("friction_logistic_point_plane", "penalty_point_point", "friction_logistic_point_point"),
 }
 POTENTIALS = {**CONTACT, **FRICTION}
 SAMPLES = {

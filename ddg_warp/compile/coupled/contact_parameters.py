@@ -7,13 +7,14 @@ from ddg_warp.compile.coupled.system import CoupledSystem
 from ddg_warp.compile.laws import contact_law
 from ddg_warp.errors import SceneError
 from ddg_warp.scene.contact import Contact, contact_names
-from ddg_warp.scene.obstacles import MESH
+from ddg_warp.scene.obstacles import BALL, MESH
 
 HALF = 0.5  # default activation distance over the smallest radius
 
 # Default contact forces that close a fraction of the activation distance. WEIGHTS: nodal weights. BENDING: fraction of EI / r^2, that
 # is, bending to ten radii. STRAIN: strain of a membrane. LIMP: strain of a rod, decisive where bending stiffness is negligible.
 WEIGHTS, BENDING, STRAIN, LIMP = 10.0, 0.01, 0.005, 1e-6
+EARTH = 9.81  # gravity that gives the contact of rigid bodies its least stiffness, also in weightlessness [m/s^2]
 BEYOND = 100.0  # largest activation distance over the size of the scene
 RESOLVED = 1e-13  # least activation distance over coordinates
 INERTIA = 10.0  # least contact stiffness after a step ended at the minimum gap, over nodal mass / dt^2
@@ -62,7 +63,7 @@ def contact_parameters(scene, coupled: CoupledSystem) -> ContactParameters | Non
                 )
             geometry = nodes, shape.kind, radius, body.name, f"body {index} ('{body.name}')", nodes[shape.cells]
             bodies.append(Body(*geometry, rigid=index))
-            forces.append((body.mass, 0.0))
+            forces.append((body.mass, WEIGHTS * body.mass * EARTH))
     gravity, obstacles = float(np.linalg.norm(scene.gravity)), len(scene.obstacles)
     scale = [max(WEIGHTS * mass * gravity, elastic) for mass, elastic in forces]
     scale_mass = np.array([(force, mass) for force, (mass, _) in zip(scale, forces, strict=True)]).reshape(-1, 2).T
@@ -73,6 +74,10 @@ def contact_parameters(scene, coupled: CoupledSystem) -> ContactParameters | Non
         shape, name = obstacle.shape, obstacle.name
         geometry = nodes, shape.kind, shape.radius, name, f"obstacle {index} ('{name}')", nodes[shape.cells]
         bodies.append(Body(*geometry, still=True, markers=markers))
+    if [body.kind for body in bodies] == [BALL]:
+        raise SceneError(
+            f"contact: {bodies[0].label}, one ball alone, meets nothing; add an obstacle, a rod, a shell or a body"
+        )
     result = _numbers(scene, law, bodies, *scale_mass)
     if law.rolling and not (result.has_friction and any(body.angles.size for body in bodies)):
         lacking = "no rod is in contact" if result.has_friction else "there is no friction"
@@ -150,8 +155,9 @@ def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: n
 
 def _refuse_ranges(scene, within: np.ndarray, names) -> None:
     """Refuse activation distances (groups, groups) beyond the scene size or below the resolution of coordinates."""
-    objects = *scene.batches, *scene.shells, *(shape for body in scene.bodies for shape in body.shapes)
-    points = np.concatenate([o.points.reshape(-1, 3) for o in objects])
+    points = [o.points.reshape(-1, 3) for o in (*scene.batches, *scene.shells)]
+    points += [s.points + sign * s.radius for body in scene.bodies for s in body.shapes for sign in (-1, 1)]
+    points = np.concatenate(points)
     size, far = np.ptp(points, axis=0).max(), np.abs(points).max()
     for g, h in np.argwhere((within > BEYOND * size) | (within < RESOLVED * far))[:1]:
         wrong = (

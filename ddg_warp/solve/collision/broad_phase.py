@@ -11,7 +11,7 @@ from ddg_warp import device_arrays
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels.collision.broad_phase.candidate_validity import motion_kernels
 from ddg_warp.kernels.collision.ccd.additive_ccd import impact_kernel
-from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, POINT_PLANE, POINT_TRIANGLE
+from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, POINT_PLANE, POINT_POINT, POINT_TRIANGLE
 from ddg_warp.solve.collision.bvh import Primitives
 from ddg_warp.solve.collision.candidate_list import CandidateList
 from ddg_warp.solve.collision.candidate_validity import CandidateValidity, SearchCounters
@@ -86,15 +86,16 @@ class BroadPhase:
         self._shift = wp.zeros(worlds, dtype=x.dtype, device=self.device)
         self._never, self.every = (wp.full(worlds, flag, dtype=int, device=self.device) for flag in (0, 1))
         self.counters, self.validity = SearchCounters(self.device), CandidateValidity(shapes, x, self.margin)
-        self._edges = primitives[2]
+        self._sampled = primitives.get(2, self._primitives[0])
         self._walked = [part for part in self._primitives if part.walked]
         *_, self._common = motion_kernels(real, device_arrays.serial(self.device))
         self.rebuild(x)
-        sides = (EDGES, 2, 2), (POINT_TRIANGLE, 1, 3), (EDGE_POINT, 2, BALLS), (POINT_PLANE, 1, PLANES)
+        sides = [(EDGES, 2, 2), (POINT_TRIANGLE, 1, 3), (EDGE_POINT, 2, BALLS), (POINT_PLANE, 1, PLANES)]
+        sides += [(POINT_POINT, BALLS, BALLS)] * shapes.balls_meet
         self.lists = [
             CandidateList(kind, primitives[first], primitives[second], shapes, worlds > 1, real, self.counters.overflow)
             for kind, first, second in sides
-            if second in primitives
+            if first in primitives and second in primitives
         ]
         self._impacts, self._passes = (
             [impact_kernel(pairs.kind, passing, real, pairs.single) for pairs in self.lists]
@@ -343,7 +344,7 @@ class BroadPhase:
         return self.search_distance if min_separation_fraction > 0.0 else 0.0
 
     def _enclose(self, x, move, together, radius_fraction: float, margin: float) -> None:
-        inputs = [self._edges.surface, self._edges.count, move, together]
+        inputs = [self._sampled.surface, self._sampled.count, move, together]
         wp.launch(self._common, self.worlds, inputs, [self._shift], device=self.device)
         for primitives in self._primitives:
             primitives.enclose(x, move, self._shift, radius_fraction, margin, self.counters.lost)

@@ -104,7 +104,7 @@ class CollisionMesh:
         return self._add(name, 0.5 * thickness, parts, span, still)
 
     def ball(self, node: int, radius: float, *, name: str | None = None, still: bool = False) -> int:
-        """Add a ball around a node, for contact with rods and shells, not balls; return the number of the object.
+        """Add a ball around a node and return the number of the object.
 
         Raises:
             SceneError: names the ball and the remedy.
@@ -169,25 +169,25 @@ class CollisionMesh:
 
     @property
     def sizes(self) -> list[int]:
-        """Sizes of the primitives that pairs need: edges, points and triangles if there are triangles, `BALLS`, `PLANES`."""
+        """Sizes of the primitives that pairs need: edges, points and triangles if there are triangles, `BALLS`, `PLANES`, if any."""
         primitives = self._parts
         return [
             *[1] * bool(primitives[3] or primitives[PLANES]),
-            2,
+            *[2] * bool(primitives[2]),
             *[3] * bool(primitives[3]),
             *[BALLS] * bool(primitives[BALLS]),
             *[PLANES] * bool(primitives[PLANES]),
         ]
 
-    def primitives(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return nodes, radius, object (n,) and span (n, 4) of the primitives of a size: number of nodes, `BALLS` or `PLANES`.
+    @property
+    def balls_meet(self) -> bool:
+        """True if two balls may form a pair, of which one is no obstacle."""
+        numbers = {number for *_, number, _ in self._parts[BALLS]}
+        return len(numbers) > 1 and not numbers <= self.obstacle
 
-        Raises:
-            SceneError: neither rods nor shells were added.
-        """
-        if not self._parts[2]:
-            raise SceneError("a contact search has no objects but balls; add rods or shells")
-        parts = self._parts[size]
+    def primitives(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return nodes, radius, object (n,) and span (n, 4) of the primitives of a size: number of nodes, `BALLS` or `PLANES`."""
+        parts = self._parts[size] or [(np.zeros((0, max(size, 1)), int), 0.0, 0, np.zeros((0, 4)))]
         number = np.repeat([part[2] for part in parts], [len(part[0]) for part in parts])
         radius = np.repeat([part[1] for part in parts], [len(part[0]) for part in parts])
         return np.concatenate([part[0] for part in parts]), radius, number, np.concatenate([part[3] for part in parts])
@@ -202,6 +202,8 @@ class CollisionMesh:
         for side in range(2):
             keys = owners * len(self.points) + ends[:, 1 - side]
             order = np.argsort(keys)
+            if not len(keys):
+                break
             index = order[np.minimum(np.searchsorted(keys[order], node_keys), len(keys) - 1)]
             result[:, side] = np.where(keys[index] == node_keys, ends[index, side], nodes[:, 0])
         return result

@@ -52,7 +52,7 @@ class FrictionSet(CollisionSet):
         if coefficients is not None:
             coefficients = wp.array(coefficients, dtype=wp.types.vector(3, real), device=self.device)
         if coefficients is not None or self.rolls:
-            neighbours = self._upload(shapes.beside(kind.first))
+            neighbours = self._upload(shapes.beside(candidates.first.size))
         self.directions = neighbours, coefficients
         self.angles = [self._upload(each) if self.rolls else None for each in angles]
         self.kernels += [self._lag, self._evaluate]

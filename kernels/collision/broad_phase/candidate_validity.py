@@ -8,7 +8,7 @@ from ddg_warp.kernels.collision.distance import distance_functions
 from ddg_warp.kernels.collision.primitives import Kind, pair_functions, sides_struct, surface_struct
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
 
-SAMPLES = 16  # edges of a world whose mean motion is the common motion
+SAMPLES = 16  # edges (or balls) of a world whose mean motion is the common motion
 # Length of searched paths, in motions: a steady motion needs one search for two steps.
 #
 # Measured: a third more pairs, but searches take 16 % instead of 23 % of the time of 10,000 strands of hair falling on a head, an H100.
@@ -74,7 +74,7 @@ def motion_kernels(real, serial: bool):
     `common`: write the common motion of each world.
     """
     X, Surface, until = wp.types.vector(3, real), surface_struct(real), until_function(serial)
-    _, _, path_offset, _ = distance_functions(real)
+    _, _, path_offset, *_ = distance_functions(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def watch(
@@ -143,15 +143,15 @@ def motion_kernels(real, serial: bool):
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def common(
-        edges: Surface, count: int, move: wp.array(dtype=X), together: wp.array(dtype=int), shift: wp.array(dtype=X)
+        sampled: Surface, count: int, move: wp.array(dtype=X), together: wp.array(dtype=int), shift: wp.array(dtype=X)
     ):
-        """Write the mean motion of a sample of edges if the world moves by one fraction, else zero."""
+        """Write the mean motion of a sample of primitives if the world moves by one fraction, else zero."""
         w = wp.tid()
         mean, number = X(), wp.min(count, wp.static(SAMPLES))
         if together[w] != 0:
             for k in range(number):
                 i = int(wp.int64(k) * wp.int64(count) / wp.int64(number))
-                mean += move[edges.nodes[i, 0] + w * edges.nodes_a_world] / real(number)
+                mean += move[sampled.nodes[i, 0] + w * sampled.nodes_a_world] / real(number)
         if not wp.isfinite(mean):
             mean = X()
         shift[w] = mean

@@ -16,7 +16,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, Kind
+from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, POINT_POINT, Kind
 
 # Squared sine of the angle below which lines count as parallel.
 PARALLEL = {wp.float64: 1.0e-20, wp.float32: 1.0e-10}
@@ -34,6 +34,8 @@ def distance_function(kind: Kind, real):
     """Return the device function `near(x) -> (w, d, n)`: weights (4,), distance [m] and direction of a collision, x (4, 3)."""
     if kind == EDGE_POINT:
         return _edge_point(real)
+    if kind == POINT_POINT:
+        return _point_point(real)
     if kind.endless:
         return _point_plane(real)
     X, W, V = node_types(real)
@@ -164,6 +166,20 @@ def _edge_point(real):
     def near(x: X):
         t, d, n = nearest(x[2], x[0], x[1])
         return W(real(1.0) - t, t, real(-1.0), real(0.0)), d, n
+
+    return near
+
+
+@cache
+def _point_point(real):
+    """Return the device function `near` of points 0 and 1."""
+    X, W, _ = node_types(real)
+
+    @wp.func
+    def near(x: X):
+        r = x[0] - x[1]
+        d = wp.length(r)
+        return W(real(1.0), real(-1.0), real(0.0), real(0.0)), d, r / wp.where(d > real(0.0), d, real(1.0))
 
     return near
 

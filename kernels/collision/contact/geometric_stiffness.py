@@ -14,10 +14,10 @@ from functools import cache
 import warp as wp
 
 from ddg_warp.kernels.collision.contact.closest_points import PARALLEL
-from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, POINT_PLANE, POINT_TRIANGLE
+from ddg_warp.kernels.collision.primitives import EDGE_POINT, EDGES, POINT_PLANE, POINT_POINT, POINT_TRIANGLE
 
-KINDS = EDGES, EDGE_POINT, POINT_TRIANGLE, POINT_PLANE
-TRIANGLES = KINDS.index(POINT_TRIANGLE)
+KINDS = EDGES, EDGE_POINT, POINT_POINT, POINT_TRIANGLE, POINT_PLANE
+POINTS, TRIANGLES = KINDS.index(POINT_POINT), KINDS.index(POINT_TRIANGLE)
 
 
 @cache
@@ -33,12 +33,12 @@ def bend_function(linear):
         """Return c_0 and c_1, zero for parameters that are absent."""
         zero, one = linear(0.0), linear(1.0)
         c0, c1 = W(), W()
-        if kind < wp.static(TRIANGLES):
+        if kind < wp.static(POINTS):
             if w[0] != zero and w[1] != zero:
                 c0 = W(-one, one, zero, zero)
             if kind == 0 and w[2] != zero and w[3] != zero:
                 c1 = W(zero, zero, one, -one)
-        else:
+        elif kind > wp.static(POINTS):
             endless = kind > wp.static(TRIANGLES)
             b, c, d = w[1] != zero, w[2] != zero, w[3] != zero
             if endless or (b and c):

@@ -1,6 +1,6 @@
 """Contact potential: energy of a collision by its distance, gradient, and rows of the Gauss-Newton factor.
 
-For a point and a triangle or plane, or an edge and a ball, the energy is psi(d) (`closest_points`, `densities.contact`). The
+For a point and a triangle or plane, an edge and a ball, or two balls, the energy is psi(d) (`closest_points`, `densities.contact`). The
 closest points of two edges jump where the edges are parallel. So with the mollifier m, 0 for parallel edges a, b and 1 beyond about two
 degrees, the energy of two edges is
 

@@ -1,0 +1,142 @@
+"""Spring car: a car on leaf springs drives over rough ground, its rear wheels driven.
+
+Each axle hangs on two straight rods, cantilevers of length L below the chassis, whose ends rotate with the axle. Wheels roll about the
+axles without friction, so that an axle takes no couple while the car stands, and a load F sinks the end of a rod by
+
+    F L^3 / (3 EI) .
+
+Wheels that rotate by an angle p and do not slip travel R p along the ground. At every time the ground carries weight and inertia.
+"""
+
+import numpy as np
+
+import ddg_warp as ddg
+from ddg_warp.run.check import once_reached
+from ddg_warp.scenes import _bodies, _many_rods
+
+WHEEL, WIDTH, ROUND = 0.05, 0.025, 2e-3  # m, radius and width of a wheel, and radius of its rounded surface
+BASE, TRACK = 0.15, 0.09  # m, of the wheels from the middle
+SPRING, RADIUS, SIDE = 0.12, 2.5e-3, 0.05  # m, length, radius of the rods, and distance from the middle
+LEAF = ddg.Material(young=4e9, poisson=0.3, density=100.0, viscosity=2e-2)
+CHASSIS, AXLE, RIM = 1.0, 0.05, 0.1  # kg, masses of the chassis, an axle and a wheel
+RANGE, STIFFNESS = 1e-3, 5e4  # m, N/m, of contact
+SLIP = 5e-3  # m/s, stick threshold of friction
+BUMP = 0.03  # m, radius of the bumps
+GRAVITY = 9.81  # m/s^2
+STANDS, STARTS = 0.6, 1.0  # s: the motor starts, and reaches its speed
+NAMES = ("sinking of the springs at rest [m]", "travel over that of wheels that do not slip", "bumps passed")
+
+
+def build(
+    speed: float = 0.5,
+    rough: float = 6e-3,
+    friction: float = 0.8,
+    sides: int = 32,
+    dt: float = 5e-3,
+    duration: float = 2.5,
+    seed: int = 3,
+) -> ddg.Scene:
+    """Build the car along x, its wheels a little above the ground.
+
+    Args:
+        speed: speed of the car [m/s]
+        rough: height of the bumps [m]
+        friction: Coulomb friction coefficient of the wheels
+        sides: edges around a wheel
+        dt: time step [s]
+        duration: duration of the run [s]
+        seed: seed of the positions of bumps
+    """
+    scene = ddg.Scene(gravity=(0.0, 0.0, -GRAVITY), analysis=ddg.Dynamics(dt=dt, duration=duration))
+    z = WHEEL + ROUND + RANGE
+    box = ddg.Box((0.0, 0.0, z + 0.02), (0.12, 0.06, 0.015))
+    chassis = scene.add_body(box, mass=CHASSIS, name="chassis")
+    upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # z to y
+    profile = [(0.0, -0.5 * WIDTH), (WHEEL, -0.5 * WIDTH), (WHEEL, 0.5 * WIDTH), (0.0, 0.5 * WIDTH)]
+    wheel = _bodies.moved(_bodies.revolved(profile, sides, ROUND), upright)
+    for side in (-1, 1):
+        x = side * BASE
+        shaft = ddg.Capsule((x, -TRACK, z), (x, TRACK, z), 4e-3)
+        axle = scene.add_body(shaft, mass=AXLE, name=f"axle {side}")
+        for y in (-SIDE, SIDE):
+            points = np.linspace((side * (BASE - SPRING), y, z), (x, y, z), 9)
+            rod = scene.add_rod(points, section=ddg.Circle(RADIUS), material=LEAF, name="spring")
+            scene.attach(rod, [0], chassis)
+            scene.attach(rod, [-1], axle)
+        for y in (-TRACK, TRACK):
+            center = (x, y, z)
+            body = scene.add_body(_bodies.moved(wheel, shift=center), mass=RIM, name="wheels")
+            drive = {"angle": Drive(speed)} if side < 0 else {}
+            scene.hinge(axle, body, point=center, axis=(0.0, 1.0, 0.0), **drive)
+    scene.add_obstacle(ddg.Plane(), name="ground")
+    along = BASE + 0.12 + np.cumsum(np.random.default_rng(seed).uniform(0.08, 0.16, 6))
+    for x in along if rough > 0.0 else ():
+        low = rough - BUMP
+        scene.add_obstacle(ddg.Capsule((x, -0.15, low), (x, 0.15, low), BUMP), name="bumps")
+    scene.contact(
+        objects=["wheels"], range=RANGE, stiffness=STIFFNESS, **_many_rods.friction_options(friction, velocity=SLIP)
+    )
+    return scene
+
+
+class Drive:
+    """Angle of the driven wheels [rad] over time: at rest until `STANDS`, at full speed [m/s] from `STARTS` on."""
+
+    def __init__(self, speed: float):
+        self.rate = speed / WHEEL
+
+    def __call__(self, t: float) -> float:
+        s = np.clip(t - STANDS, 0.0, STARTS - STANDS)
+        return float(self.rate * (0.5 * s * s / (STARTS - STANDS) + max(0.0, t - STARTS)))
+
+
+def observe(model, state) -> dict[str, float]:
+    """Return `_bodies.observe` with position and height of the chassis [m], its height above the axles, and its pitch [rad]."""
+    chassis = state.body("chassis")
+    axles = np.mean([state.body(f"axle {side}").position[2] for side in (-1, 1)])
+    return _bodies.observe(model, state) | {
+        "x": float(chassis.position[0]),
+        "z": float(chassis.position[2]),
+        "above": float(chassis.position[2] - axles),
+        "pitch": float(-np.arcsin(chassis.rotation[2, 0])),
+    }
+
+
+def check(result) -> list[ddg.Check]:
+    """Check springs, travel, and that the ground carries the car."""
+    checks = [*_many_rods.checks(result), _many_rods.weight_check(result, 0.02)]
+    checks += once_reached(result, STANDS, NAMES[:1], lambda: _resting(result))
+    return checks + once_reached(result, result.scene.analysis.duration, NAMES[1:], lambda: _driving(result))
+
+
+def _resting(result) -> list[ddg.Check]:
+    sunk = result.series["above"][0] - result.at(STANDS, "above")
+    stiffness = LEAF.young * np.pi * RADIUS**4 / 4.0
+    exact = 0.25 * CHASSIS * GRAVITY * SPRING**3 / (3.0 * stiffness)
+    return [ddg.Check(NAMES[0], sunk, exact, 0.05, "F L^3 / (3 EI)", relative=True)]
+
+
+def _driving(result) -> list[ddg.Check]:
+    scene, end = result.scene, result.times[-1]
+    drive = next(joint.angle for joint in scene.body_joints if joint.angle is not None)
+    moved = result.series["x"][-1] - result.at(STANDS, "x")
+    bumps = [obstacle.shape.points[0, 0] for obstacle in scene.obstacles[1:]]
+    front = result.series["x"][-1] + BASE
+    passed = sum(x < front for x in bumps)
+    return [
+        ddg.Check(NAMES[1], moved / (WHEEL * drive(end)), 1.0, 0.03, "rolling"),
+        ddg.Check(NAMES[2], float(passed), float(len(bumps)), 0.0, "positions of bumps"),
+    ]
+
+
+def picture(result, frames) -> dict:
+    """Draw the car at the start, on the bumps and behind them."""
+    times = sorted(frames)
+    return {"points_by_time": {t: frames[t] for t in (times[0], times[3], times[5])}}
+
+
+def benchmark() -> ddg.bench.Study:
+    """Study the height of the chassis over steps."""
+    return ddg.bench.Study(
+        {"dt": (1e-2, 5e-3, 2.5e-3)}, lambda result: result.series["z"][-1], {"dt": 1.25e-3}, unit="m"
+    )
