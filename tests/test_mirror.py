@@ -49,6 +49,7 @@ TESTED_BY = {
     "kernels/newton/contact_newton": ("collision/test_steps.py", "contact"),
     "kernels/residual": ("test_tolerance.py", "subset_residual_test"),
     "kernels/residual/rod_residual": ("kernels/test_chain.py", "rotary_inertia"),
+    "kernels/rigid_bodies": ("test_rigid_bodies.py", "heavy_top"),
     "kernels/stepping": ("test_warm_start.py", "further"),
     "kernels/stepping/decoupled_rods": ("collision/test_decoupled_step.py", "decoupled"),
     "kernels/stepping/local_error": ("test_step_control.py", "error"),

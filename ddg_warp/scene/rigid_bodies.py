@@ -124,8 +124,7 @@ class RigidBodies:
         Raises:
             SceneError: a shape without volume, an inertia that no body has, or a missing quantity; the message names it.
         """
-        single = (shapes,) if shapes is None or isinstance(shapes, Sphere | Capsule | Mesh) else tuple(shapes)
-        shapes = tuple(shape for shape in single if shape is not None)
+        shapes = () if shapes is None else tuple(shapes) if isinstance(shapes, Iterable) else (shapes,)
         for shape in shapes:
             if not isinstance(shape, Sphere | Capsule | Mesh):
                 raise SceneError(

@@ -8,8 +8,9 @@ import inspect
 from collections import defaultdict
 from functools import cache
 
-import effects_of_movies  # noqa: F401  (adds its calls)
-import effects_of_solvers  # noqa: F401  (adds its calls)
+import effects_of_bodies  # noqa: F401  (adds its calls)
+import effects_of_movies  # noqa: F401
+import effects_of_solvers  # noqa: F401
 import numpy as np
 import pytest
 from effects import CALLS, Change, observed
