@@ -1,6 +1,5 @@
 """Arguments of calls on rigid bodies as data; see `effects`."""
 
-import numpy as np
 from effects import CALLS, DEVICE, DT, NOTHING, RUBBER, Call, Change, line
 
 import ddg_warp as ddg
