@@ -430,7 +430,8 @@ class Model:
 
         Args:
             points: positions (P, 3) or (worlds, P, 3) [m] in the order of `curves`. Reference frames are transported from rest to
-                these positions, and edges glued to a shell follow it. Ghost nodes of clamped ends stay.
+                these positions, and edges glued to a shell follow it. Ghost nodes of clamped ends stay. Rigid bodies start as the
+                scene has them, and nodes that they carry stay with them, with their velocities.
             velocities: (P, 3) or (worlds, P, 3) [m/s].
             spins: rate of twist angles (edges,) or (worlds, edges) [rad/s]; by default zero, and as the shell rotates where edges
                 are glued. Given spins switch on gyroscopic moments in the following steps, see `Integrator`, gyroscopic.
@@ -480,6 +481,8 @@ class Model:
                     for rod in self.coupled.host.rods:
                         blocks[:, rod.edges, 0] = values[..., start[rod.rod] + np.arange(len(rod.edges))]
                     array.assign(blocks.reshape(-1, 3))
+            if self.coupled.bodies:
+                self.coupled.bodies.carry(state.coupled)
         if points is not None:
             self.carry_frames(state)
         if self.coupled is not None:

@@ -76,7 +76,10 @@ def test_one_ball_alone_is_refused():
 
 def test_friction_of_a_ball_warns():
     """Friction at the centre of a ball does not roll it; a mesh rolls."""
-    for shape, warned in ((ddg.Sphere((0, 0, 0.0205), 0.02), 1), (ddg.Mesh(*ddg.meshes.sphere(1, 0.02), radius=1e-3), 0)):
+    for shape, warned in (
+        (ddg.Sphere((0, 0, 0.0205), 0.02), 1),
+        (ddg.Mesh(*ddg.meshes.sphere(1, 0.02), radius=1e-3), 0),
+    ):
         scene = ddg.Scene()
         scene.add_obstacle(ddg.Plane((0, 0, -0.01)), name="floor")
         scene.add_body(shape, density=1000.0, name="odd")

@@ -169,6 +169,14 @@ def _dome(scene, material) -> Added:
     )
 
 
+def _with_a_body(scene, material) -> Added:
+    """Add a rod whose last node a box carries."""
+    added = _rod(line(0.0 * X, X, 6), section=ddg.Circle(0.02))(scene, material)
+    box = scene.add_body(ddg.Box(1.05 * X, (0.05, 0.018, 0.018), radius=2e-3), density=1000.0, name="box")
+    scene.attach(added.rods[0], [-1], box)
+    return Added(added.hold, _force_on_rod(added.rods[0], 4), rods=added.rods)
+
+
 def _mixed(*adders):
     def add(scene, material) -> Added:
         added = [adder(scene, material) for adder in adders]
@@ -210,6 +218,7 @@ def add_floor(scene, gap: float, motion=None, **options) -> float:
     """Add a floor below all objects, which ignore each other; return its height [m]."""
     heights = [batch.points[..., 2].min() - np.max(batch.section.radius) for batch in scene.batches]
     heights += [shell.points[:, 2].min() - 0.5 * np.max(shell.thickness) for shell in scene.shells]
+    heights += [shape.points[:, 2].min() - shape.radius for body in scene.bodies for shape in body.shapes]
     height = min(heights, default=0.0) - gap
     scene.add_obstacle(ddg.Plane((0.0, 0.0, height)), motion=motion, name="floor")
     scene.contact(range=RANGE, friction=0.2, **options)
@@ -219,7 +228,7 @@ def add_floor(scene, gap: float, motion=None, **options) -> float:
 
 def ignore_pairs_of_objects(scene) -> None:
     """Ignore contact between all rods and shells."""
-    names = sorted({item.name for item in (*scene.batches, *scene.shells)})
+    names = sorted({item.name for item in (*scene.batches, *scene.shells, *scene.bodies)})
     for i, one in enumerate(names):
         for two in names[i:]:
             scene.contact_between(one, two, ignore=True)
@@ -249,6 +258,7 @@ OBJECTS = {
     "rods and shells": Object(_mixed(_rod(), _joined(False), _stiffened, _sheet("hinge"))),
     "shells of both kinds": Object(_mixed(_sheet("midedge_dof"), _dome), axis=UP, turns=False),
     "rods by the turning angle": Object(_mixed(_rod(curvature="angle"), _joined(True, curvature="angle"))),
+    "rod with a body": Object(_with_a_body, axis=UP),
     "magnetised rod": Object(_magnetised, turns=False),
     "rod in contact": Object(
         _between_balls(_rod(line(0.0 * X, X, 8), section=ddg.Circle(0.02)), X, 0.02, (0.2, 0.3, 0.4)), axis=UP

@@ -48,6 +48,12 @@ def elastic_energy(model, state, variant) -> np.ndarray:
     return sum(variant.each(value) for name, value in names.items() if name not in ("kinetic", "gravity", "contact"))
 
 
+def body_masses(model) -> np.ndarray:
+    """Return the masses of rigid bodies with carried nodes (bodies,) [kg]."""
+    host = model.coupled.host if model.scene.bodies else None
+    return host.mass[host.rigid_bodies.origins, 0] if host else np.zeros(0)
+
+
 def assert_close(values, expected, rtol: float = 1e-9, atol: float = 0.0, message: str = "") -> None:
     np.testing.assert_allclose(values, expected, rtol=rtol, atol=atol, err_msg=message)
 
@@ -107,7 +113,11 @@ def reactions(kind, variant):
     model = variant.build(scene)
     state = statics.solve(model)
     lift = sum(variant.each(reaction.force)[:, 2] for reaction in model.reactions(state))
-    assert_close(lift, 0.5 * _mass(model).sum(), rtol=1e-4 if variant.precision == "float32" else 1e-5)
+    assert_close(
+        lift,
+        0.5 * (_mass(model).sum() + body_masses(model).sum()),
+        rtol=1e-4 if variant.precision == "float32" else 1e-5,
+    )
 
 
 def stresses(kind, variant):
@@ -268,6 +278,8 @@ def couple(kind, variant):
     total = sum(variant.each(reaction.moment) for reaction in model.reactions(state, point=(0.0, 0.0, 0.0)))
     weight = _mass(model)[:, None] * np.array([0.0, 0.0, -0.5])
     total = total + np.cross(variant.each(state.points()), weight).sum(1)
+    for k, mass in enumerate(body_masses(model)):
+        total = total + np.cross(variant.each(state.body(k).position), mass * np.array([0.0, 0.0, -0.5]))
     if model.touch:  # friction acts on centrelines, which leaves a couple
         assert_equilibrium(model, state, 0.5 * _mass(model).sum(), variant)
     else:
@@ -450,7 +462,7 @@ def failure(kind, variant):
     except ddg.SolverError as error:
         assert error.outcome, error
         assert error.outcome in str(error)
-        assert any(word in str(error) for word in ("rod", "shell", "node", "vertex", "joint")), error
+        assert any(word in str(error) for word in ("rod", "shell", "node", "vertex", "joint", "body")), error
         assert error.state is not None
         assert np.isfinite(error.state.points()).all()
     else:
@@ -502,7 +514,12 @@ def controls(kind, variant):
     model, _, _ = rest_model(kind, variant)
     down = np.outer(factors, (0.0, 0.0, -1.0))
     weight = _mass(model)[:, None] * down[:, None]
-    for step_controls in (ddg.Controls(gravity=down), ddg.Controls(forces=weight)):
+    on_bodies = {}
+    if model.scene.bodies:
+        loads = np.zeros((variant.worlds, len(model.scene.bodies), 6))
+        loads[..., :3] = body_masses(model)[:, None] * down[:, None]
+        on_bodies["wrenches"] = loads
+    for step_controls in (ddg.Controls(gravity=down), ddg.Controls(forces=weight, **on_bodies)):
         integrator, state = ddg.Integrator(model), model.state()
         for _ in range(3):
             state = integrator.step(state, DT, step_controls)
