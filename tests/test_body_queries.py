@@ -1,4 +1,4 @@
-"""Queries and records of scenes with rigid bodies: given states, stresses beside joints, files of scenes without rods."""
+"""Queries and records of scenes with rigid bodies: given states, stresses next to joints, files of scenes without rods."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def hung(joints: int):
 
 
 def test_carried_nodes_stay_with_their_bodies():
-    """Given positions of carried nodes are those of the bodies, so that no strain appears or vanishes in the first step."""
+    """Carried nodes start at the poses of the bodies, so that no strain appears or vanishes in the first step."""
     model, _ = hung(1)
     rest = model.state().points()
     state = model.state(points=rest + 1e-3 * np.sin(7.0 * np.arange(rest.size)).reshape(rest.shape))
@@ -35,7 +35,7 @@ def test_carried_nodes_stay_with_their_bodies():
 
 @pytest.mark.parametrize("joints", [1, 3])
 def test_stresses_beside_joints(joints):
-    """Joints of bodies are no half cells of the rod of their number; there may be more of them than rods."""
+    """Joints of bodies, more than rods, do not count as half cells of rods."""
     model, rod = hung(joints)
     integrator, state = ddg.Integrator(model), model.state()
     for _ in range(60):

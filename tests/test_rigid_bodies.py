@@ -34,7 +34,7 @@ def build(scene, **options):
 
 
 def crossings(time, values) -> np.ndarray:
-    """Return the times at which values rise through zero, linear in between."""
+    """Return the times of rises through zero, linear in between."""
     k = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
     return time[k] - values[k] / (values[k + 1] - values[k]) * (time[1] - time[0])
 
@@ -43,8 +43,8 @@ def total_momentum(model, state) -> np.ndarray:
     """Return the angular momentum of all bodies about the origin (3,)."""
     result = state.coupled.momentum.numpy().sum(0)
     for index, body in enumerate(model.scene.bodies):
-        at = state.body(index)
-        result = result + body.mass * np.cross(at.position, at.velocity)
+        pose = state.body(index)
+        result = result + body.mass * np.cross(pose.position, pose.velocity)
     return result
 
 
@@ -56,7 +56,7 @@ def reference_rod(scene, edges: int = 40):
 
 
 def test_free_asymmetric_top_flips_at_its_period(device):
-    """Flips of a top about its middle axis every 29.148726 s (Jacobi elliptic functions), to second order in the step."""
+    """Flips of a top about the middle axis every 29.148726 s (Jacobi elliptic functions), to second order in the step."""
     moments, rates, errors = np.array([2.0, 3.0, 4.0]), np.array([0.02, 1.0, 0.02]), []
     for dt in (0.1, 0.05):
         scene = ddg.Scene(gravity=(0, 0, 0))
@@ -145,7 +145,7 @@ def two_bodies(**drive):
 
 
 def test_torque_between_two_bodies():
-    """w_a = -t tau / I_a and w_b = t tau / I_b; the angle counts turns."""
+    """w_a = -t tau / I_a and w_b = t tau / I_b; the angle counts revolutions."""
     _model, integrator, state = build(two_bodies(torque=0.01))
     for _ in range(1000):
         state = integrator.step(state, 0.01)
@@ -183,7 +183,7 @@ def test_damping_of_a_hinge():
 
 
 def test_stops_of_a_hinge():
-    """A torque turns a body to its stop, where it rests at torque / stiffness beyond."""
+    """A torque rotates a body to the stop, and torque / stiffness beyond."""
     scene = ddg.Scene(gravity=(0, 0, 0), mass_damping=5.0)
     body = scene.add_body(mass=1.0, inertia=(5e-3,) * 3, center=(0, 0, 0))
     scene.hinge(body, point=(0, 0, 0), axis=(0, 0, 1), torque=0.01, stops=(-1.0, 0.5))
@@ -195,7 +195,7 @@ def test_stops_of_a_hinge():
 
 
 def flywheel(rate: float, tilt: float, dt: float, duration: float) -> float:
-    """Return the change of total momentum, relative, of a flywheel at a rate on a free body that turns by `tilt` [rad/s]."""
+    """Return the change of total momentum, relative, of a flywheel at a rate on a free body that rotates by `tilt` [rad/s]."""
     scene = ddg.Scene(gravity=(0, 0, 0))
     frame = scene.add_body(mass=1.0, inertia=(1e-2, 2e-2, 1.5e-2), center=(0, 0, 0), angular_velocity=(tilt, 0, 0))
     rates = {"velocity": (0, -0.1 * tilt, 0), "angular_velocity": (tilt, 0, rate)}
@@ -209,7 +209,7 @@ def flywheel(rate: float, tilt: float, dt: float, duration: float) -> float:
 
 
 def test_flywheel_conserves_momentum():
-    """A flywheel that turns by 10 rad a step conserves momentum about its axis; while that turns, to first order in the step."""
+    """A flywheel of 10 rad a step conserves momentum about a fixed axis; about a rotating one, to first order in the step."""
     assert flywheel(1000.0, 0.0, 0.01, 0.5) < 1e-12
     errors = [flywheel(300.0, 0.3, dt, 0.1) for dt in (1e-3, 5e-4)]
     assert errors[0] < 1e-3
@@ -250,7 +250,7 @@ def test_two_cubes_on_a_twisted_rod():
 
 
 def payload(ratio: float):
-    """Return a scene with a body of `ratio` times the mass of a clamped rod on its end."""
+    """Return a scene with a body of `ratio` times the mass of a clamped rod on the end."""
     scene = ddg.Scene()
     points = np.linspace((0, 0, 0), (LENGTH, 0, 0), 41)
     rod = scene.add_rod(points, section=ddg.Circle(RADIUS), material=ddg.Material(young=YOUNG, density=1000.0))
@@ -293,7 +293,7 @@ def test_preconditioners_agree(preconditioner):
 
 
 def test_carried_masses_move_with_the_body():
-    """A free body that carries heavy rod ends has their moments of inertia, and total momentum stays."""
+    """A free body with heavy rod ends has the moments of inertia of all, and total momentum stays."""
     scene = ddg.Scene(gravity=(0, 0, 0))
     spin = np.array([0.2, 0.1, 3.0])
     body = scene.add_body(mass=0.1, inertia=(1e-4, 2e-4, 2.5e-4), center=(0, 0, 0), angular_velocity=spin)
@@ -333,7 +333,7 @@ def test_box_comes_to_rest_on_a_floor():
 @pytest.mark.parametrize("turn", [1 / 6, 1 / 2])
 @pytest.mark.parametrize("place", [0.05, 0.19, 0.198])
 def test_bar_turns_past_no_rod(turn, place):
-    """A bar of .2 m that would turn by a part of a turn in a step stops at a rod in its way, near its axis or at its end."""
+    """A bar of .2 m that would rotate by 1/6 or 1/2 in a step stops at a rod, near the axis or at the end."""
     dt, angle = 0.01, 2.0 * np.pi * turn
     middle = 0.5 * angle
     scene = ddg.Scene(gravity=(0, 0, 0))
@@ -400,7 +400,7 @@ def test_equilibria_of_bodies_on_rods():
 
 
 def test_stability_of_a_pinned_body():
-    """A body of weight W above its pin, held by a spring k at the height a, stands if k a^2 > W l."""
+    """A body of weight W above a pin, with a spring k at the height a, stands if k a^2 > W l."""
     for stiffness, stands in ((60.0, True), (40.0, False)):
         scene = ddg.Scene(gravity=(0, 0, -10.0))
         body = scene.add_body(mass=1.0, inertia=(1e-3,) * 3, center=(0, 0, 0.5))  # W l = 5 N m
@@ -466,7 +466,7 @@ def test_wrenches_on_a_pinned_body():
 
 
 def test_worlds_of_bodies_are_independent():
-    """Every world follows its own torque, as alone; a state survives a snapshot bit by bit."""
+    """Every world follows a torque of this world, as alone; a state survives a snapshot bit by bit."""
     model = two_bodies().build(device=DEVICE, precision="float64", worlds=3)
     integrator, state, torques = ddg.Integrator(model), model.state(), np.array([[0.0], [0.01], [-0.02]])
     for _ in range(10):
@@ -478,7 +478,7 @@ def test_worlds_of_bodies_are_independent():
 
 
 def test_recorded_poses(tmp_path):
-    """A recording holds the poses of bodies, and the surfaces of their shapes as those of moving obstacles."""
+    """A recording holds the poses of bodies, and the surfaces of their shapes as moving obstacles."""
     model, integrator, state = build(cube_on_cantilever(2e-3))
     states = []
     with ddg.Recorder(model, tmp_path / "run", usd=False) as recorder:

@@ -19,7 +19,7 @@ CELL = 0.07  # m, of the grid on which boxes and rods start
 
 
 def build(count: int, seed: int) -> ddg.Scene:
-    """Build `count` boxes and as many rods on a grid above a floor, turned at random."""
+    """Build `count` boxes and as many rods on a grid above a floor, in random orientations."""
     random = np.random.default_rng(seed)
     scene = ddg.Scene(analysis=ddg.Dynamics(dt=1.0 / 240.0, duration=0.5, rtol=3e-2))
     width = int(np.ceil((2 * count / 4) ** 0.5))

@@ -37,7 +37,7 @@ def _moments(shape) -> tuple[float, np.ndarray, np.ndarray]:
 
 
 def _about(center, volume: float, second: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the integrals about the origin from those about the centre."""
+    """Return the integrals about the origin from integrals about the centre."""
     return volume, volume * center, second + volume * np.outer(center, center)
 
 

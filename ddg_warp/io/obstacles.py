@@ -24,7 +24,7 @@ SHARP = np.cos(np.radians(35.0))  # cosine between a triangle and the vertex nor
 
 @dataclass(frozen=True)
 class Obstacles:
-    """Obstacles and rigid bodies of a model as surfaces that follow their nodes; see `model.obstacles`.
+    """Obstacles and rigid bodies of a model as surfaces that follow nodes; see `model.obstacles`.
 
     A plane has three nodes, its point and two more 1 m away along in-plane directions, and is shown as a rectangle. A ball has its
     center, a capsule both ends of its axis, a mesh its vertices, shown without thickness.

@@ -30,8 +30,8 @@ class CoupledState:
         lag: time-lagged rows of each element set (rows, W E).
         last: strains of each damped set at this state.
         data: data (rows, W E), by index, of sets in the magnetic field or with normals that supports rotate.
-        rotation, momentum: orientations of rigid bodies (W B,), columns are principal axes, and their angular momenta in space
-            (W B,) [kg m^2/s]; empty without bodies.
+        rotation: orientations of rigid bodies (W B,), columns are principal axes; empty without bodies.
+        momentum: angular momenta of rigid bodies in space (W B,) [kg m^2/s]; empty without bodies.
         rate: 1/h of the last step (W,) [1/s] if inertia entered its contact stiffness, else 0. Empty without such contact.
     """
 
@@ -373,14 +373,14 @@ class CoupledModel:
                 self._update_lag(index, after, q, [moved, wanted, within, same], old, new)
 
     def _update_lag(self, index: int, state, q: wp.array, inputs: list, old: wp.array, new: wp.array) -> None:
-        """Write the lagged rows of an element set from its `old` ones, the frames of a state and dofs q."""
+        """Write the lagged rows of an element set from the `old` rows, the frames of a state and dofs q."""
         part, element_inputs = self.sets[index], self.elements(state, index, q)
         element_inputs.lag = old
         kernel = frames.lag_kernel(part.term.measure, self.real, arrays.serial(self.device))
         self.sweep(kernel, [element_inputs, *inputs], [new], part.elements)
 
     def turn_ghosts(self, before: CoupledState, start: CoupledState, q: wp.array, moved: wp.array) -> None:
-        """Rotate ghosts of rigid joints and bodies in `start` from those of `before` by the rotation vectors in q, then zero these."""
+        """Rotate ghosts of joints and bodies from `before` to `start` by the rotation vectors in q, then zero these vectors."""
         for index, part in enumerate(self.sets):
             if part.term.measure.spins:
                 self._update_lag(index, start, q, [moved, 1, 0, before.lag[index]], before.lag[index], start.lag[index])

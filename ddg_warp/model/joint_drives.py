@@ -55,9 +55,9 @@ class JointDrives:
 
 def _value(number: int, joint, label: str, t: float, factor: float) -> float:
     """Return the angle or the torque of a hinge, zero without."""
-    given = getattr(joint, label)
-    if given is None:
+    drive = getattr(joint, label)
+    if drive is None:
         return 0.0
-    if not callable(given):
-        return given if label == "angle" else factor * given
-    return float(argument_checks.value_at(f"hinge {joint.name or number}: {label}", given, t))
+    if not callable(drive):
+        return drive if label == "angle" else factor * drive
+    return float(argument_checks.value_at(f"hinge {joint.name or number}: {label}", drive, t))

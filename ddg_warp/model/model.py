@@ -59,7 +59,7 @@ class Model:
         worlds: number of independent copies.
         allow_rounding: whether steps and solves run although float32 rounding exceeds its limit.
         order: points and edges in the user's order.
-        drives: hinges of rigid bodies, and what drives them.
+        drives: hinges of rigid bodies, with driven angles and torques.
         fields: rest strains of rods that the scene prescribes, see `Scene.prescribe`.
     """
 

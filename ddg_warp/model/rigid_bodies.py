@@ -57,7 +57,7 @@ class RigidBodyTables:
         self.carry(state)
 
     def carry(self, state) -> None:
-        """Place carried nodes of a state by the poses of their bodies, with their velocities; capturable."""
+        """Move carried nodes of a state to the poses of the bodies, with the velocities there; capturable."""
         inputs = [state.rotation, state.momentum, self.moments, self.arms, self.owner, self.carried, self.origins]
         wp.launch(
             self._carry,

@@ -118,8 +118,9 @@ class RigidBodies:
             angular_velocity: initial angular velocity (3,) [rad/s].
             name: name for queries; bodies of one name have common contact parameters.
 
-        Attach rods and shells with `attach`. With `contact` the shapes collide with rods, shells, obstacles and other bodies, but not
-        with the rods and shells that the body carries, nor with bodies that a joint connects to it.
+        Attach rods and shells with `attach`. With `contact` the shapes collide with rods, shells, obstacles and other bodies. They
+        do not collide with the rods and shells that the body carries, nor with bodies that a joint connects to it. Friction acts at
+        the centre of a `Sphere` and on the axis of a `Capsule`, which it does not roll; give such bodies a `Mesh`.
 
         Raises:
             SceneError: a shape without volume, an inertia that no body has, or a missing quantity; the message names it.
@@ -191,7 +192,7 @@ class RigidBodies:
         """Join two bodies by a hinge, or a body to the world, driven by an angle, or by a torque; return the handle.
 
         The angle is that of `second` relative to `first` about the axis, zero at rest; without `second` that of the body relative to
-        the world. It counts turns, as long as it changes by less than half a turn a step.
+        the world. It counts revolutions, as long as it changes by less than half of one a step.
 
         Args:
             first, second: bodies; without `second` the world.

@@ -360,8 +360,8 @@ class Structures(Meridians, Magnets, Contacts):
         rotate.
 
         Raises:
-            SceneError: an index out of range, not as many vertices as nodes, another `spin`; at `build`, points that do not coincide,
-                or a node that two bodies, or a body and a support, hold.
+            SceneError: an index out of range, not as many vertices as nodes, or another `spin`. At `build`: points that do not
+                coincide, or a node that two bodies, or a body and a support, hold.
         """
         if isinstance(shell, Handle) and shell.kind == BODY:
             if vertices is not None or spin is not None:

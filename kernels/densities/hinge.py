@@ -2,7 +2,7 @@
 
 psi = sum_i k_i (e_i - e0_i)^2 / 2 + c / h (theta - theta_n)^2 / 2 - tau theta + k_l (theta - [theta_min, theta_max])^2 / 2 ,
 
-with the motor's angle in e0, damping c, the angle theta_n at the last step and its length h, the motor's torque tau, and stops of
+with the motor's angle in e0, its torque tau, damping c, the angle theta_n at the last step, and the step length h. Stops have the
 stiffness k_l: the last bracket is the closest angle between the stops.
 """
 
@@ -31,7 +31,7 @@ def _laws(real, n):
 
     @wp.func
     def strain(e: E, p: P):
-        """Return the strains less those at rest."""
+        """Return the strains less the rest strains."""
         return e - E(p[6], p[7], p[8], p[9], p[10], p[11])
 
     @wp.func

@@ -3,10 +3,11 @@
 `separation`: x_2 - x_1 of the point as carried by each body [m], of ball joints and of the joints below.
 
 `hinge`: the separation, then the rotation of the second body relative to the first about an axis. Both bodies carry a ghost edge along
-the axis, with a director. Bending and twist between the ghosts are those of a rod vertex (`rod_curvature_twist`) without a length:
-2 tan(phi/2) about both directors [1], zero where the axes agree, and the angle theta about the axis [rad], which counts turns.
+the axis, with a director. Bending and twist between the ghosts are the strains of a rod vertex (`rod_curvature_twist`) without a
+length. These are 2 tan(phi/2) about both directors [1], zero where the axes agree, and the angle theta about the axis [rad], which
+counts revolutions.
 
-Ghosts rotate with their bodies, as those of rigid joints; see `joint_curvature_twist` for the rows of their rotation vectors. Dofs:
+Ghosts rotate with their bodies, as at rigid joints; see `joint_curvature_twist` for the rows of their rotation vectors. Dofs:
 x_2 - x_1 (3), rotation vectors of both bodies (3 each). Lagged data: (u, t) of both ghosts, reference twist.
 """
 

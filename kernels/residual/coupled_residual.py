@@ -280,7 +280,7 @@ def elements_function(real, linear):
         change: real,
         rounding_error: real,
     ):
-        """Return force, size, stiffness, energy change and its rounding with those of elements added.
+        """Return force, size, stiffness, energy change and its rounding with the contributions of elements added.
 
         The first local node of an element adds its energy.
         """

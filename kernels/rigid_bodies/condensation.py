@@ -1,4 +1,4 @@
-"""Condensation of carried nodes onto the dofs of their rigid bodies: residuals and matrix.
+"""Condensation of carried nodes onto the dofs of rigid bodies: residuals and matrix.
 
 With dx = dc + D dw of a carried node, force f and stiffness K on it act on the body as
 
@@ -148,9 +148,9 @@ def balance_kernel(real, linear, quadratic: bool, contact: bool):
 
 @cache
 def condense_kernel(real, linear, quadratic: bool, alone: bool):
-    """Build the kernel `condense`: add the entries of carried nodes to those of their bodies, and the inertia of rotations.
+    """Build the kernel `condense`: add the entries of carried nodes to the entries of their bodies, and the inertia of rotations.
 
-    One thread takes one entry of the bodies' rows and columns, and adds L^T K R of the listed entries K of carried nodes, with L and R
+    One thread takes one entry of the bodies' rows and columns, and adds L^T K R of the listed entries K of carried nodes. L and R are
     the identity (`PLAIN`) or D of a carried node. `alone`: no element set has begun the matrix.
     """
     M, Bodies, Mass = wp.types.matrix((3, 3), linear), bodies_type(real), mass_type(real, quadratic)
@@ -209,9 +209,9 @@ def condense_kernel(real, linear, quadratic: bool, alone: bool):
 def contact_kernels(real, linear):
     """Build the kernels of contact on carried nodes, one thread a body.
 
-    `gather`: add products of pairs at carried nodes to those of the bodies, and p . H p of their blocks.
+    `gather`: add products of pairs at carried nodes to the products of the bodies, and p . H p of their blocks.
     `condense`: write the diagonal blocks of bodies, and the block between origin and rotation, from the blocks of carried nodes.
-    `condense_product`: add products at carried nodes to those of the bodies.
+    `condense_product`: add products at carried nodes to the products of the bodies.
     """
     M, H = wp.types.matrix((3, 3), linear), wp.types.vector(3, linear)
     Bodies, PairSet, total = bodies_type(real), set_struct(real, linear), total_function(real, linear)

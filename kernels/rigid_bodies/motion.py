@@ -162,7 +162,7 @@ def turn_kernel(real):
 
 @cache
 def depart_kernel(real):
-    """Build the kernel `depart`: let the motion of the predictor, which contact limits, begin at R_n and turn by `longest` at most.
+    """Build the kernel `depart`: let the motion of the predictor, which contact limits, begin at R_n and rotate by `longest` at most.
 
     Longer arcs are left to Newton's method, whose updates are limited one by one.
     """
@@ -197,7 +197,7 @@ def depart_kernel(real):
 def arc_kernels(real):
     """Build the kernels that bound rotations in one motion, which CCD takes as straight.
 
-    `measure`: write the fraction of a motion that turns no body of a CCD body by more than `longest`, and the least one of each world.
+    `measure`: write the fraction of a motion that rotates no body of a CCD body by more than `longest`, and the least of each world.
     `shorten`: take that fraction of the motion, each CCD body its own, or all the least one of their world.
     `note`: let the fractions of worlds be at most the least one.
     """

@@ -42,7 +42,7 @@ def test_balls_collide():
 
 
 def test_ball_rests_on_balls():
-    """A ball on three others in a tray carries its weight by them: balls and planes alone, without rods or shells."""
+    """Three balls in a tray carry a fourth one: balls and planes alone, without rods or shells."""
     scene = ddg.Scene(mass_damping=5.0)
     scene.add_obstacle(ddg.Plane(), name="floor")
     low = np.array([[np.cos(a), np.sin(a), 0.0] for a in 2.0 * np.pi * np.arange(3) / 3])
@@ -75,7 +75,7 @@ def test_one_ball_alone_is_refused():
 
 
 def test_friction_of_a_ball_warns():
-    """Friction at the centre of a ball does not roll it; a mesh rolls."""
+    """A ball with friction at the centre does not roll; a mesh does."""
     for shape, warned in (
         (ddg.Sphere((0, 0, 0.0205), 0.02), 1),
         (ddg.Mesh(*ddg.meshes.sphere(1, 0.02), radius=1e-3), 0),
@@ -87,6 +87,6 @@ def test_friction_of_a_ball_warns():
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             scene.build(device="cpu")
-        found = [str(entry.message) for entry in caught if entry.category is ddg.SceneWarning]
-        assert len(found) == warned
-        assert all("body 0 ('odd')" in text and "does not roll" in text for text in found)
+        texts = [str(entry.message) for entry in caught if entry.category is ddg.SceneWarning]
+        assert len(texts) == warned
+        assert all("body 0 ('odd')" in text and "does not roll" in text for text in texts)

@@ -53,9 +53,9 @@ def positions(name: str, family: str) -> np.ndarray:
     if name == "edge_edge":
         return random.normal(size=(4, COUNT, 3)) + np.array([0.5, 0.5, 0.0, 0.0])[:, None, None] * [1.0, 0.0, 0.0]
     if name == "point_point":
-        apart = 0.01 if family == "touching" else 1.0
+        distance = 0.01 if family == "touching" else 1.0
         first = random.normal(size=(COUNT, 3))
-        return np.stack([first, first + apart * random.normal(size=(COUNT, 3))])
+        return np.stack([first, first + distance * random.normal(size=(COUNT, 3))])
     corners = RIGHT[: 3 if name == "point_triangle" else 2, None] + 0.2 * random.normal(size=(1, COUNT, 3))
     if family == "touching":
         share = random.dirichlet(np.full(len(corners), 3.0), COUNT).T

@@ -35,10 +35,10 @@ def bodies(*nodes, count: int = 2, **options) -> tuple[ddg.Scene, list]:
     return scene, made
 
 
-def joined(call: str, *which, **options):
+def joined(call: str, *chosen, **options):
     """Join bodies of a scene, by number."""
     scene, made = bodies()
-    return getattr(scene, call)(*(made[k] if isinstance(k, int) else k for k in which), **options)
+    return getattr(scene, call)(*(made[k] if isinstance(k, int) else k for k in chosen), **options)
 
 
 def hinged(**options):

@@ -170,7 +170,7 @@ def _dome(scene, material) -> Added:
 
 
 def _with_a_body(scene, material) -> Added:
-    """Add a rod whose last node a box carries."""
+    """Add a rod with a box on the last node."""
     added = _rod(line(0.0 * X, X, 6), section=ddg.Circle(0.02))(scene, material)
     box = scene.add_body(ddg.Box(1.05 * X, (0.05, 0.018, 0.018), radius=2e-3), density=1000.0, name="box")
     scene.attach(added.rods[0], [-1], box)

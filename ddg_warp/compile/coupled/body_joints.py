@@ -21,16 +21,16 @@ def joint_sets(scene, coupled) -> list[CoupledSet]:
             values = JOINTS["ball_joint"].bind(measure=1.0, stiffness=[k] * 3)
             lag, slots, term = np.zeros((0, 1)), blocks[:, None], JOINTS["ball_joint"]
         else:
-            term, held = JOINTS["hinge"], k * arm**2
-            about = held if joint.call == "weld" or joint.angle is not None else 0.0
+            term, angular = JOINTS["hinge"], k * arm**2
+            about = angular if joint.call == "weld" or joint.angle is not None else 0.0
             lower, upper = joint.stops or (-NO_STOP, NO_STOP)
             values = term.bind(
                 measure=1.0,
-                stiffness=[k, k, k, held, held, about],
+                stiffness=[k, k, k, angular, angular, about],
                 damping=joint.damping,
                 lower=lower,
                 upper=upper,
-                stop=held if joint.stops else 0.0,
+                stop=angular if joint.stops else 0.0,
             )
             director = _normal(joint.axis)
             lag = np.concatenate([director, joint.axis, director, joint.axis, [0.0]])[:, None]

@@ -3,11 +3,11 @@
 A body has a node at its centre of mass and a rotation block. Nodes that it carries have no dofs, x = c + R X. Their masses belong to
 the body, so that a body with its carried masses moves as one.
 
-A body that a joint pins to the world turns about the point of the joint instead, with its moments of inertia there. Its centre of mass
-is then a carried node, on which the weight acts.
+A body that a joint pins to the world rotates about the point of the joint, with its moments of inertia there. Its centre of mass is
+then a carried node, on which the weight acts.
 
-Why not a stiff joint as between bodies: the pinned point has no error, and the midpoint rule no centre outside its circle, which
-lengthens periods (pendulum of 1 rad at 190 steps a period: 1.0e-4 instead of 1.7e-4).
+Alternative: a stiff joint, as between bodies. Its point has an error, and by the midpoint rule the centre leaves its circle, which
+lengthens periods (pendulum of 1 rad at 190 steps a period: 1.7e-4 instead of 1.0e-4).
 """
 
 from dataclasses import dataclass
@@ -19,13 +19,14 @@ from ddg_warp.errors import SceneError
 
 @dataclass
 class RigidBodyArrays:
-    """Rigid bodies (B) and their carried nodes (C), in the order of bodies.
+    """Rigid bodies (B) and carried nodes (C), in the order of bodies.
 
     Attributes:
-        origins, spins: dof blocks of the points about which bodies turn, and of rotations (B,).
+        origins, spins: dof blocks of the points about which bodies rotate, and of rotations (B,).
         centers: dof blocks of centres of mass (B,), carried nodes of pinned bodies, else `origins`.
         pinned: mask of pinned bodies (B,).
-        carried: dof blocks of carried nodes (C,); owner: body of each (C,); starts: first carried node of each body (B + 1,).
+        carried: dof blocks of carried nodes (C,).
+        owner: body of each carried node (C,); starts: first carried node of each body (B + 1,).
         arms: X of carried nodes in principal axes (C, 3) [m].
         moments: principal moments of inertia (B, 3) [kg m^2]; axes: principal axes at rest, columns (B, 3, 3).
         velocity, angular_velocity: initial velocity of the centre and angular velocity in space (B, 3).
@@ -54,7 +55,7 @@ class RigidBodyArrays:
         return len(self.origins)
 
     def lengths(self, mass: np.ndarray) -> np.ndarray:
-        """Return the length by which moments on each body are compared with forces (B,) [m], for masses of dof blocks.
+        """Return the length of each body that relates moments to forces (B,) [m], for masses of dof blocks.
 
         It is the radius of gyration, or the longest arm.
         """
@@ -129,7 +130,7 @@ def carried_nodes(
 
 
 def take_masses(scene, coupled) -> None:
-    """Add the masses of carried nodes to their bodies, and fix the carried nodes, which have no dofs.
+    """Add the masses of carried nodes to the bodies, and fix the carried nodes, as these have no dofs.
 
     Raises:
         SceneError: a support fixes a carried node.

@@ -208,26 +208,26 @@ def shapes_of(host) -> CollisionMesh:
 
 
 def _attached(host) -> list[tuple[int, int]]:
-    """Return the pairs of collision bodies of one rigid body, of bodies that a joint connects, and of bodies with what they carry."""
+    """Return the pairs of collision bodies of one rigid body, of bodies that a joint connects, and of bodies with carried objects."""
     rigid = host.rigid_bodies
     if rigid is None:
         return []
     owner = np.full(host.blocks, -1)
     owner[rigid.carried] = rigid.owner
-    linked = [{body} for body in range(len(rigid))]  # of each rigid body: those without contact with it
+    linked = [{body} for body in range(len(rigid))]  # of each rigid body: bodies without contact with it
     for blocks in rigid.anchors:
         first, second = owner[blocks].tolist()
-        for body, other in ((first, second), (second, first)):
+        for body, partner in ((first, second), (second, first)):
             if body >= 0:
-                linked[body].add(other)
-    held = [[] for _ in range(len(rigid))]  # collision bodies of each rigid body, or with a node that it carries
+                linked[body].add(partner)
+    members = [[] for _ in range(len(rigid))]  # collision bodies of each rigid body, or with a node that it carries
     for number, body in enumerate(host.contact_parameters.bodies):
         for index in set(owner[body.nodes].tolist()) - {-1}:
-            held[index].append(number)
+            members[index].append(number)
     return [
-        (number, other)
+        (number, member)
         for number, body in enumerate(host.contact_parameters.bodies)
         if body.rigid >= 0
         for index in linked[body.rigid] - {-1}
-        for other in held[index]
+        for member in members[index]
     ]

@@ -1,8 +1,8 @@
 """Carried nodes of rigid bodies in tangents on the host: forces and stiffness condensed onto the dofs of their bodies.
 
-A node at the arm y from the origin of its body moves by dx = dc + dw x y for small rotations dw in space, from the orientation of the
-state. Forces f add to the body f and y x f. Stiffness K adds P^T K P with dx = P (dc, dw), and, as x is of second order in dw, the
-geometric stiffness of a force -f of the node,
+Small rotations dw in space, from the orientation of the state, move a node at the arm y from the origin of its body by
+dx = dc + dw x y. Forces f add to the body f and y x f. Stiffness K adds P^T K P with dx = P (dc, dw). As x is of second order in dw, a
+force -f of the node adds the geometric stiffness
 
     -f . d^2 x / dw^2 = (f . y) I - (f y^T + y f^T) / 2 .
 """
@@ -50,7 +50,7 @@ class CarriedDofs:
         return result.ravel()
 
     def condense(self, q: np.ndarray, forces: np.ndarray) -> np.ndarray:
-        """Return forces (size,) with those of carried nodes on their bodies."""
+        """Return forces (size,), with the forces on carried nodes moved to the bodies."""
         result = forces.reshape(-1, 3).copy()
         of_nodes = result[self.carried].copy()
         result[self.carried] = 0.0

@@ -60,7 +60,7 @@ class CoupledTangent(TangentBlock):
         return self.carried.condense(q, result) if self.carried else result
 
     def nodal_loads(self, factor: float, q: np.ndarray) -> np.ndarray:
-        """Return external forces (size,) with those of carried nodes on these nodes."""
+        """Return external forces (size,), of carried nodes on the nodes themselves."""
         result = super().loads(factor, q)
         if not self.coupled.user_forces:
             return result
@@ -255,9 +255,9 @@ class CoupledTangent(TangentBlock):
     def give(self, inputs: dict[str, np.ndarray]) -> None:
         super().give(inputs)
         if "wrenches" in inputs:
-            rigid, given = self.host.rigid_bodies, self.given.reshape(self.worlds, -1, 3)
-            given[:, rigid.centers] += inputs["wrenches"][..., :3]
-            given[:, rigid.spins] += inputs["wrenches"][..., 3:]
+            rigid, loads = self.host.rigid_bodies, self.given.reshape(self.worlds, -1, 3)
+            loads[:, rigid.centers] += inputs["wrenches"][..., :3]
+            loads[:, rigid.spins] += inputs["wrenches"][..., 3:]
         self.given_field[:] = inputs.get("field", 0.0)
 
     def prescribe(self, state, load_factor: float) -> None:
@@ -369,8 +369,8 @@ class CoupledTangent(TangentBlock):
             dofs = self.offset + 3 * world * host.blocks
             for nodes, edges, ends, spins in parts:
                 places = (dofs + 3 * blocks[:, None] + np.arange(3) for blocks in (nodes, spins))
-                at, spins = places
-                nodes = np.where(carried[nodes][:, None], -1, at)
+                positions, spins = places
+                nodes = np.where(carried[nodes][:, None], -1, positions)
                 result.append(Body(nodes, dofs + 3 * edges, ends, spins))
         return result
 

@@ -144,8 +144,8 @@ def _principal_axes(tangent: Tangent, state, masses: np.ndarray) -> tuple[sparse
     masses[places[:, None] + np.arange(3)] = moments
     row, column = np.indices((3, 3)).reshape(2, -1)
     turns = rotations - np.eye(3)
-    at = (places[:, None] + row).ravel(), (places[:, None] + column).ravel()
-    turned = sparse.csc_matrix((turns.reshape(-1, 9).ravel(), at), shape=(tangent.size, tangent.size))
+    entries = (places[:, None] + row).ravel(), (places[:, None] + column).ravel()
+    turned = sparse.csc_matrix((turns.reshape(-1, 9).ravel(), entries), shape=(tangent.size, tangent.size))
     return sparse.identity(tangent.size, format="csc") + turned, masses
 
 

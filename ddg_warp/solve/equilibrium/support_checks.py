@@ -27,8 +27,8 @@ def require_supports(model) -> None:
                     "scene.clamp_ring(...)"
                 )
         carried = host.rigid_bodies.carried if host.rigid_bodies else ()
-        other = [*(node for shell in host.meridians for node in shell.nodes), *carried]
-        spatial = np.setdiff1d(np.arange(host.nodes), other)
+        excluded = [*(node for shell in host.meridians for node in shell.nodes), *carried]
+        spatial = np.setdiff1d(np.arange(host.nodes), excluded)
         loose = np.flatnonzero(~host.holds[spatial].any(0)) if spatial.size else spatial
         if loose.size:
             raise SceneError(

@@ -224,8 +224,8 @@ class Tangent:
         np.maximum.at(worst, self.island[self.angle], np.abs(direction[self.angle]))
         first = 0
         for part in self.parts:
-            at, step = self.of(part, q), self.of(part, direction)
-            edges, turns = part.edges(at), part.edges(part.spread(at, step))
+            position, step = self.of(part, q), self.of(part, direction)
+            edges, turns = part.edges(position), part.edges(part.spread(position, step))
             length, turned = np.linalg.norm(edges, axis=1), np.linalg.norm(turns, axis=1)
             turn = np.divide(turned, length, out=np.zeros_like(turned), where=length > 0.0)
             islands = worst[first : first + part.islands]

@@ -1,4 +1,4 @@
-"""Entries of the coupled matrix that carried nodes of rigid bodies add to those of the bodies."""
+"""Entries of the coupled matrix that carried nodes add to the rows and columns of rigid bodies."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from ddg_warp.kernels.rigid_bodies.condensation import PLAIN
 
 
 class CondensationPlan:
-    """Condensed entries of raw entries, those with a carried node in row or column; see `kernels.rigid_bodies.condensation`.
+    """Condensed entries of raw entries, which have a carried node in row or column; see `kernels.rigid_bodies.condensation`.
 
     Args:
         rigid: `RigidBodyArrays`.
@@ -54,12 +54,13 @@ class CondensationPlan:
         """Return the arrays of `condense_kernel` by name, and the position `crossing` between origin and rotation of each body.
 
         Args:
-            keys: row * blocks + column of all entries but raw ones, sorted; position: their positions; raw_position: of raw entries.
+            keys: row * blocks + column of all entries but raw ones, sorted.
+            position: their positions; raw_position: of raw entries.
         """
         rigid = self.rigid
-        own = np.concatenate([rigid.origins, rigid.spins])
+        blocks_of_bodies = np.concatenate([rigid.origins, rigid.spins])
         keys_of_terms = self.rows.astype(np.int64) * blocks + self.columns
-        diagonal = own.astype(np.int64) * blocks + own
+        diagonal = blocks_of_bodies.astype(np.int64) * blocks + blocks_of_bodies
         diagonal = diagonal[np.isin(diagonal, keys)]
         wanted = np.unique(np.concatenate([keys_of_terms, diagonal]))
         row, column = np.divmod(wanted, blocks)

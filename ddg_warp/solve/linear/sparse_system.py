@@ -27,7 +27,7 @@ class SparseSystem:
         angles: first block of a twist angle, and the first one after all of them; has_angles: True if there are any.
         `diagonal`: position of each H_ii, -1 if in bands or left out.
         condensed: arrays of `kernels.rigid_bodies.condensation.condense_kernel` by name; None without rigid bodies. Entries of carried
-            nodes follow the slices, and take no part in products.
+            nodes follow the slices, and are left out of products.
         `meets`, `adds`: incidence lists (offsets, items) of each element set, by blocks and by positions.
     """
 
@@ -87,7 +87,7 @@ class SparseSystem:
 
 
 def unique_entries(row: np.ndarray, column: np.ndarray, blocks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the index of every entry among the unique ones, and rows and columns of these, sorted by rows, then columns."""
+    """Return the index of every entry among unique entries, and their rows and columns, sorted by rows, then columns."""
     order = lists(column, blocks)[1]
     order = order[lists(row[order], blocks)[1]]
     row, column = row[order], column[order]

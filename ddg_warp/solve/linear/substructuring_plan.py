@@ -143,9 +143,9 @@ class SubstructuringPlan:
         is_joint = np.bincount(node, minlength=host.blocks) > 1
         if host.rigid_bodies:  # a body is a joint of its centre and its rotation
             bodies = host.rigid_bodies
-            own = np.column_stack([bodies.origins, bodies.spins])
-            others = ~np.isin(rotations[:, 1], np.append(bodies.spins, bodies.world))
-            rotations = np.concatenate([rotations[others], own])
+            of_bodies = np.column_stack([bodies.origins, bodies.spins])
+            of_joints = ~np.isin(rotations[:, 1], np.append(bodies.spins, bodies.world))
+            rotations = np.concatenate([rotations[of_joints], of_bodies])
             is_joint[bodies.carried] = True
         is_joint[rotations[:, 0]] = True
         rotation = np.full(host.blocks, -1)

@@ -12,7 +12,8 @@ class RigidBodies:
     """Rigid bodies of a `CoupledNewton`: flight, carried nodes, residuals and the matrix.
 
     Args:
-        tables: `RigidBodyTables`; sparsity: `SparseSystem`; `residual`: `ResidualAssembler`.
+        tables: `RigidBodyTables`.
+        sparsity: `SparseSystem`.
         linear: scalar type of directions.
         quadratic: True if blocks have a quadratic potential; `outer`: True if there are contact forces or user-defined ones.
 
@@ -70,7 +71,7 @@ class RigidBodies:
         ]
 
     def place(self, iterates, islands) -> None:
-        """Place carried nodes at the iterate."""
+        """Move carried nodes to the iterate."""
         tables, struct = self.tables, self.bodies
         inputs = [self.predicted, tables.arms, tables.owner, tables.carried, tables.origins, tables.spins]
         inputs += [self.coupled.blocks, islands.status]
@@ -83,7 +84,7 @@ class RigidBodies:
         self._launch(self._spread, self._carried, [*inputs, self.coupled.blocks], [direction])
 
     def bound_rotations(self, start: wp.array, q: wp.array, ccd_body: wp.array, num_ccd_bodies: int, together) -> None:
-        """Shorten the motions from `start` to q that turn a body by more than its `longest`.
+        """Shorten the motions from `start` to q that rotate a body by more than `longest`.
 
         Args:
             ccd_body: CCD body of every block; together: (worlds,), nonzero where all move by one fraction.
@@ -98,11 +99,11 @@ class RigidBodies:
         wp.launch(self._shorten, (worlds, self.coupled.blocks), inputs, [q], device=self.coupled.device)
 
     def note_fractions(self, time: wp.array) -> None:
-        """Let step fractions (worlds,) be at most those of `bound_rotations`."""
+        """Limit step fractions (worlds,) to the fractions of `bound_rotations`."""
         wp.launch(self._note, self.coupled.worlds, [self.least], [time], device=self.coupled.device)
 
     def gather(self, products, p: wp.array, product: wp.array, system) -> None:
-        """Add the products of contact pairs at carried nodes, see `PairProduct.settle`, to those of the bodies."""
+        """Add the products of contact pairs at carried nodes, see `PairProduct.settle`, to the products of the bodies."""
         inputs = [self.bodies, products.sets, products.in_pairs, p, system.masks.inactive, system.wanted]
         self._launch(self._gather, len(self.tables), inputs, [product, system.dots])
 
@@ -134,7 +135,7 @@ class RigidBodies:
         self._launch(self._balance, len(self.tables), [inputs, self.bodies, sets, *islands.arrays], [outputs])
 
     def condense(self, mass: wp.array, islands, matrix: wp.array) -> None:
-        """Add the entries of carried nodes to those of the bodies, after the assembly of element sets."""
+        """Add the entries of carried nodes to the entries of bodies, after the assembly of element sets."""
         lists = self.sparsity.condensed
         inputs = [
             mass,

@@ -51,8 +51,8 @@ class StepLimit:
         """Limit the proposed motion from `base` to `q`; `proposed` keeps the proposed end.
 
         Args:
-            place: places the nodes that rigid bodies carry at q. A limited body ends on its arc, beside the straight motions that have
-                been searched. Its straight motions to there are then limited in turn, up to `ARC_ROUNDS` times.
+            `place`: moves carried nodes of rigid bodies to q. A limited body ends on its arc, next to the straight motions that have
+                been searched. Its straight motions to there are then limited again, up to `ARC_ROUNDS` times.
             rigid_bodies: `RigidBodies`, whose rotations are bounded, or None.
         """
         q, blocks, far = iterates.q, self.coupled.blocks, FAR * self.search.margin
@@ -75,7 +75,7 @@ class StepLimit:
             self._follow_arcs(q, place)
 
     def _follow_arcs(self, q: wp.array, place: Callable[[], None]) -> None:
-        """Place the limited bodies on their arcs, and limit the straight motions to there."""
+        """Move the limited bodies to the arcs, and limit the straight motions to there."""
         for _ in range(ARC_ROUNDS):
             place()
             wp.copy(self._fractions, self.search.time)

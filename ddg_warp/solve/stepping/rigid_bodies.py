@@ -45,7 +45,7 @@ class RigidBodyStep:
         struct.moment.assign(np.ascontiguousarray(values[:, 3:]))
 
     def predict(self, before) -> None:
-        """Find the orientations after the flight, and place carried nodes there."""
+        """Find the orientations after the flight, and move carried nodes there."""
         tables, islands = self.tables, self.newton.islands
         inputs = [before.rotation, before.momentum, tables.moments, len(tables), islands.arrays[1]]
         self._launch(self._predict, inputs, [self.bodies.predicted, self.bodies.bodies.inertia])
