@@ -8,8 +8,8 @@
                   `State.body_poses`; contacts/{world, objects, point, gap, force, friction} (n, ...) if wanted, pairs of all frames
                   one after the other, up to contacts/ends[f] for frame f
     /model        curves/{counts, closed, radius, names, batch}, surfaces/{triangles, first, names, thickness} if there are
-                  any, obstacles/{...}, see `Obstacles`, touching/{names, size, force}, see `ContactScales`, parameters/NAME,
-                  attributes/NAME of rods
+                  any, obstacles/{...}, see `Obstacles`, rigid_bodies/{names, mass, ...}, see `Bodies`,
+                  touching/{names, size, force}, see `ContactScales`, parameters/NAME, attributes/NAME of rods
     /control      options of the run
     /checkpoint   a and b, alternately the state at the last frame, at full precision; the attribute current names the last;
                   below each, run/NAME are counts of the run up to that frame, see `Counts`
@@ -340,9 +340,9 @@ def _other(reader: TrajectoryReader, model) -> tuple[str, str] | None:
     for name in CURVE_FIELDS:
         if not _equal(getattr(reader.curves, name), getattr(model.curves, name)):
             return "rods", name
-    for kind in ("surfaces", "obstacles", "contact_scales"):
+    for kind in ("surfaces", "obstacles", "rigid_bodies", "contact_scales"):
         recorded, wanted = getattr(reader, kind), getattr(model, kind)
-        kind = "contact" if kind == "contact_scales" else kind
+        kind = "contact" if kind == "contact_scales" else kind.replace("_", " ")
         if recorded is None or wanted is None:
             if recorded is not wanted:
                 return kind, ""

@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 
 from ddg_warp import argument_checks
+from ddg_warp.io.bodies import Bodies
 from ddg_warp.io.contact_records import FIELDS as PAIR_FIELDS
 from ddg_warp.io.contact_records import Contacts, ContactScales
 from ddg_warp.io.curves import CurveSet, checked_curves
@@ -229,6 +230,7 @@ class TrajectoryReader:
         surfaces: Triangles among the points, or None.
         obstacles: Obstacles as surfaces, or None.
         obstacle_points: Nodes of moving obstacles [m], shape (F, M, 3) or (F, B, M, 3), read when indexed, or None.
+        rigid_bodies: Rigid bodies, or None.
         body_poses: Poses of rigid bodies, see `State.body_poses`, shape (F, N, 3, 4) or (F, B, N, 3, 4), read when indexed, or None.
         contacts: `Contacts` of each frame, read when indexed by a number, or None if not recorded.
         contact_scales: Names and typical scales of contact, or None.
@@ -273,11 +275,11 @@ class TrajectoryReader:
         if "surfaces" in model:
             self.surfaces = Surfaces(**{name: _array(model["surfaces"][name]) for name in SURFACE_FIELDS})
         self.obstacles, self.obstacle_points = None, fields.get("obstacle_points")
-        self.body_poses = fields.get("body_poses")
+        self.rigid_bodies, self.body_poses = None, fields.get("body_poses")
         if "obstacles" in model:
-            self.obstacles = Obstacles(
-                **{field.name: _array(model["obstacles"][field.name]) for field in fields_of(Obstacles)}
-            )
+            self.obstacles = _described_by(Obstacles, model["obstacles"])
+        if "rigid_bodies" in model:
+            self.rigid_bodies = _described_by(Bodies, model["rigid_bodies"])
         self.contact_scales = self.contacts = None
         if "touching" in model:
             names, size, force = (_array(model["touching"][name]) for name in ("names", "size", "force"))
@@ -418,6 +420,11 @@ def _refuse_misfits(curves: Curves, surfaces: Surfaces | None, point_count: int)
         fits = fits and 0 == first[0] and first[-1] <= len(triangles) == len(surfaces.thickness)
     if not fits:
         raise ValueError(f"rods and surfaces do not fit the {point_count} points of a frame")
+
+
+def _described_by(kind: type, group: h5py.Group):
+    """Return an object of a dataclass whose fields are the datasets of a group."""
+    return kind(**{field.name: _array(group[field.name]) for field in fields_of(kind)})
 
 
 def _array(dataset: h5py.Dataset) -> np.ndarray:

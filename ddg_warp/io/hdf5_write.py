@@ -23,15 +23,16 @@ def write_attributes(group: h5py.Group, values: Mapping) -> None:
 
 
 def write_model(group: h5py.Group, model) -> None:
-    """Write rods, surfaces, obstacles and parameters of a model."""
+    """Write rods, surfaces, obstacles, rigid bodies and parameters of a model."""
     curves, parameters = group.create_group("curves"), group.create_group("parameters")
     for name in CURVE_FIELDS:
         overwrite(curves, name, np.asarray(getattr(model.curves, name)))
     for name in SURFACE_FIELDS if model.surfaces is not None else ():
         overwrite(group.require_group("surfaces"), name, np.asarray(getattr(model.surfaces, name)))
-    if model.obstacles is not None:
-        for each in fields(model.obstacles):
-            overwrite(group.require_group("obstacles"), each.name, np.asarray(getattr(model.obstacles, each.name)))
+    for kind in ("obstacles", "rigid_bodies"):
+        described = getattr(model, kind)
+        for each in fields(described) if described is not None else ():
+            overwrite(group.require_group(kind), each.name, np.asarray(getattr(described, each.name)))
     if model.contact_scales is not None:
         for name, values in vars(model.contact_scales).items():
             overwrite(group.require_group("touching"), name, np.asarray(values))

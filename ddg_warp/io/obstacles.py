@@ -102,7 +102,7 @@ class Obstacles:
     def points(self, k: int, nodes: np.ndarray | None = None) -> np.ndarray:
         """Return points of an obstacle's surface [m], shape (p, 3), for its nodes (n, 3) [m]; by default at rest."""
         kind = self.kinds[k]
-        nodes = self._rest(k) if nodes is None else np.asarray(nodes, float)
+        nodes = self.nodes(k) if nodes is None else np.asarray(nodes, float)
         if kind == PLANE:
             (low, high, left, right), unit_square = self.spans[k], _square()[0][:, :2]
             return nodes[0] + ([low, left] + unit_square * [high - low, right - left]) @ (nodes[1:] - nodes[0])
@@ -126,7 +126,8 @@ class Obstacles:
             count += len(points[-1])
         return np.concatenate(points), np.concatenate(cells)
 
-    def _rest(self, k: int) -> np.ndarray:
+    def nodes(self, k: int) -> np.ndarray:
+        """Return the nodes of an obstacle at rest [m], shape (n, 3)."""
         first = int(self.counts[:k].sum())
         return self.rest[first : first + int(self.counts[k])]
 
@@ -138,7 +139,7 @@ class Obstacles:
             if not len(triangles):
                 parts.append((triangles.ravel(), triangles))
                 continue
-            surface, rest = SimpleNamespace(triangles=triangles), self._rest(k)
+            surface, rest = SimpleNamespace(triangles=triangles), self.nodes(k)
             cosine = np.einsum("tci,ti->tc", vertex_normals(surface, rest)[triangles], face_normals(surface, rest))
             sharp = (cosine < SHARP).any()
             each = np.arange(triangles.size).reshape(-1, 3)
@@ -147,7 +148,7 @@ class Obstacles:
 
     def _around(self, k: int, ends: np.ndarray) -> np.ndarray:
         """Return points of a capsule, rotated by parallel transport of its axis from rest."""
-        rest_axis, axis = (polyline.unit((line[1] - line[0])[None]) for line in (self._rest(k), ends))
+        rest_axis, axis = (polyline.unit((line[1] - line[0])[None]) for line in (self.nodes(k), ends))
         first = polyline.unit(np.cross(rest_axis, np.eye(3)[np.argmin(np.abs(rest_axis))]))
         first = polyline.transport(first, rest_axis, axis) if polyline.dot(rest_axis, axis)[0] > -1.0 + 1e-9 else first
         frame = np.concatenate([first, np.cross(axis, first), axis])

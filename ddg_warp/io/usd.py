@@ -2,7 +2,9 @@
 
 All rods of a batch (of one name and one material) form one prim below /World, with its own preview surface. The prim is a linear
 BasisCurves, or a Mesh of tubes for programs without curves or curve materials. Every surface and every obstacle is one
-Mesh, contact is Points. z is up, lengths are in metres, times in seconds times timeCodesPerSecond.
+Mesh, contact is Points. A rigid body is an Xform at its centre: each frame stores its translation and orientation, while the
+spheres, capsules and meshes below it are constant. UsdPhysics gives its mass and inertia; it is kinematic, as its motion is recorded.
+z is up, lengths are in metres, times in seconds times timeCodesPerSecond.
 
 USD saves a file over its old table of contents: a process killed meanwhile leaves it unreadable. The stage is therefore
 saved to `NAME.partial.usdc`, and a copy of it replaces the final file atomically after each save.
@@ -17,14 +19,16 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from pxr import Tf, Usd, UsdGeom, Vt
+from pxr import Tf, Usd, UsdGeom, UsdPhysics, Vt
 
 from ddg_warp import argument_checks
+from ddg_warp.io.bodies import Bodies
 from ddg_warp.io.colors import PALETTE
 from ddg_warp.io.contact_records import Contacts, ContactScales
 from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.io.paths import CurveError
 from ddg_warp.io.shapes import Curves, Shapes
+from ddg_warp.io.usd_bodies import BodyPrim
 from ddg_warp.io.usd_check import validate
 from ddg_warp.io.usd_contact import ContactsPrim, ObstaclePrim
 from ddg_warp.io.usd_prims import ColorBy, CurvesPrim, Frame, PointsPrim, SurfacePrim, TubesPrim
@@ -52,6 +56,7 @@ class CurvesWriter:
         block: Frames between two saves, at least; a killed process leaves the frames saved last.
         obstacles: Obstacles, such as `model.obstacles`; moving obstacles are written once a world.
         contact_scales: Names and typical scales of contact, for frames with contacts.
+        bodies: Rigid bodies, such as `model.rigid_bodies`, whose shapes are the last obstacles; without, these are moving obstacles.
     """
 
     def __init__(
@@ -67,6 +72,7 @@ class CurvesWriter:
         attributes: Mapping[str, np.ndarray] | None = None,
         obstacles: Obstacles | None = None,
         contact_scales: ContactScales | None = None,
+        bodies: Bodies | None = None,
     ):
         argument_checks.positive("CurvesWriter: fps", fps, "1/s")
         self.path = Path(path)
@@ -80,7 +86,7 @@ class CurvesWriter:
         shapes = curves if isinstance(curves, Shapes) else _drawable(curves)
         self._rows = shapes.worlds * shapes.point_count
         color_by = ColorBy(*color_by) if color_by else None
-        self._prims: list[PointsPrim] = []
+        self._prims: list[PointsPrim | BodyPrim] = []
         kept = {name: np.tile(np.asarray(values), shapes.worlds) for name, values in (attributes or {}).items()}
         for name, values in kept.items():
             if values.shape != shapes.curves.counts.shape:
@@ -92,10 +98,16 @@ class CurvesWriter:
             self._prims += _define_rods(self._stage, shapes, colors, color_by, TubesPrim if tube else CurvesPrim, kept)
         if shapes.surfaces is not None:
             self._prims += _define_surfaces(self._stage, shapes, color_by)
-        for k in range(0 if obstacles is None else len(obstacles)):
+        alone = 0 if obstacles is None else len(obstacles) - (0 if bodies is None else int(bodies.shapes.sum()))
+        for k in range(alone):
             for world in range(shapes.worlds if obstacles.moved[k] else 1):
                 path = _free_path(self._stage, str(obstacles.names[k]))
                 self._prims.append(ObstaclePrim(self._stage, path, obstacles, k, world))
+        if bodies is not None:
+            UsdPhysics.SetStageKilogramsPerUnit(self._stage, 1.0)
+            for k, world in np.ndindex(len(bodies), shapes.worlds):
+                path = _free_path(self._stage, str(bodies.names[k]))
+                self._prims.append(BodyPrim(self._stage, path, bodies, k, obstacles, world))
         if contact_scales is not None:
             self._prims.append(ContactsPrim(self._stage, _free_path(self._stage, "contacts"), contact_scales))
         self._unsaved = _size_of_defaults(self._stage)
@@ -116,6 +128,7 @@ class CurvesWriter:
         triangle_scalars: Mapping[str, np.ndarray] | None = None,
         obstacles: np.ndarray | None = None,
         contacts: Contacts | None = None,
+        body_poses: np.ndarray | None = None,
     ) -> None:
         """Write a frame.
 
@@ -125,8 +138,9 @@ class CurvesWriter:
             velocities: Velocities [m/s], shape (P, 3).
             scalars: Values at the points by name, each of shape (P,), or vectors (P, 3), written unchanged as primvars.
             triangle_scalars: Values of the triangles of all surfaces by name, each of shape (T,), likewise.
-            obstacles: Nodes of moving obstacles [m], shape (M, 3), world after world.
+            obstacles: Nodes of moving obstacles [m], shape (M, 3) or (worlds, M, 3).
             contacts: Contacts of the frame.
+            body_poses: Rotation and position of rigid bodies [R | x], shape (N, 3, 4) or (worlds, N, 3, 4).
 
         Raises:
             CurveError: The time code is not later than the frame before, or the number of points is wrong.
@@ -142,7 +156,9 @@ class CurvesWriter:
                 f"{self.path}: a frame at {time} s has no later time code than the one before, at {self._fps} a second; write frames "
                 "in the order of their times, with a larger fps"
             )
-        frame = Frame(points, velocities, scalars or {}, triangle_scalars or {}, obstacles, contacts)
+        obstacles = None if obstacles is None else np.reshape(obstacles, (-1, 3))
+        body_poses = None if body_poses is None else np.reshape(body_poses, (-1, 3, 4))
+        frame = Frame(points, velocities, scalars or {}, triangle_scalars or {}, obstacles, contacts, body_poses)
         for prim in self._prims:
             prim.write(code, frame)
         if self._frames == 0:

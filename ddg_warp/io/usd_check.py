@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from pxr import Usd, UsdGeom
+from pxr import Usd, UsdGeom, UsdPhysics
 
 from ddg_warp.io.paths import CurveError, MissingFileError, existing
 from ddg_warp.io.usd_read import opened
 
 EXTENT_SLACK = 1e-5  # of the extent's size: positions and extents are float32
+RIGID_SLACK = 1e-5  # of entries of R R^T: quaternions are float32
 
 
 def validate(path, outside: bool = False) -> list[str]:
@@ -16,7 +17,8 @@ def validate(path, outside: bool = False) -> list[str]:
 
     USD's own validators run if the installed USD has them. In addition every time sample of every BasisCurves and Mesh is checked.
     Counts match the points, values are finite, widths are positive except for tips of 0, normals (if any) are unit vectors or 0, and
-    the extent contains the points. Points have as many widths as points, positive, and finite values.
+    the extent contains the points. Points have as many widths as points, positive, and finite values. Transforms of rigid bodies are
+    finite and rigid.
 
     Args:
         path: The file.
@@ -35,11 +37,13 @@ def _problems_of(stage: Usd.Stage, path) -> list[str]:
     """Return the problems of a whole stage."""
     problems = _from_validators(stage)
     shapes = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.BasisCurves) or prim.IsA(UsdGeom.Mesh)]
-    if not shapes:
-        problems.append(f"{path}: there are neither BasisCurves nor meshes")
+    bodies = [prim for prim in stage.Traverse() if prim.HasAPI(UsdPhysics.RigidBodyAPI)]
+    if not (shapes or bodies):
+        problems.append(f"{path}: there are neither BasisCurves nor meshes nor rigid bodies")
     points = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Points)]
     located = [(prim, problem) for prim in shapes for problem in _problems(prim)]
     located += [(prim, problem) for prim in points for problem in _problems_of_points(UsdGeom.Points(prim))]
+    located += [(prim, problem) for prim in bodies for problem in _problems_of_body(UsdGeom.Xformable(prim))]
     return problems + [f"{prim.GetPath()}: {problem}" for prim, problem in located]
 
 
@@ -79,6 +83,19 @@ def _problems_of_points(prim: UsdGeom.Points) -> list[str]:
         problems += [f"at time {time}, {each}" for each in _check_frame(prim, time, len(widths), 0.5 * widths)]
         if not (widths > 0.0).all():
             problems.append(f"at time {time}, the widths are not positive")
+    return problems
+
+
+def _problems_of_body(prim: UsdGeom.Xformable) -> list[str]:
+    """Return the problems of the transforms of a rigid body."""
+    problems = []
+    for time in prim.GetTimeSamples() or [Usd.TimeCode.Default()]:
+        matrix = np.array(prim.GetLocalTransformation(time))
+        rotation = matrix[:3, :3]
+        if not np.isfinite(matrix).all():
+            problems.append(f"at time {time}, the transform is not finite")
+        elif np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID_SLACK or np.linalg.det(rotation) < 0.0:
+            problems.append(f"at time {time}, the transform is not rigid")
     return problems
 
 

@@ -42,7 +42,7 @@ class ColorBy:
 class Frame:
     """Data of one time sample: points (P, 3) [m], velocities (P, 3) [m/s] or None, scalars by name.
 
-    Nodes of moving obstacles (worlds M, 3) [m] and contacts may be None.
+    Nodes of moving obstacles (worlds M, 3) [m], contacts, and poses of rigid bodies (worlds N, 3, 4) may be None.
     """
 
     points: np.ndarray
@@ -51,6 +51,7 @@ class Frame:
     at_triangles: Mapping[str, np.ndarray]
     obstacles: np.ndarray | None = None
     contacts: Contacts | None = None
+    body_poses: np.ndarray | None = None
 
 
 class PointsPrim:

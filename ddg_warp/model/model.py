@@ -14,6 +14,7 @@ from ddg_warp.compile.boundary_conditions import scene_motions
 from ddg_warp.compile.precision import choose, warn_of_rounding
 from ddg_warp.compile.rod_groups import compile_rod_groups
 from ddg_warp.errors import SceneError
+from ddg_warp.io.bodies import Bodies
 from ddg_warp.io.contact_records import ContactScales
 from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.io.shapes import Curves, Surfaces
@@ -155,6 +156,14 @@ class Model:
     def bodies(self) -> list[str]:
         """Names of the rigid bodies, in their order."""
         return [body.name for body in self.scene.bodies]
+
+    @property
+    def rigid_bodies(self) -> Bodies | None:
+        """Rigid bodies, for recordings; None without."""
+        if not self.scene.bodies:
+            return None
+        host = self.coupled.host
+        return Bodies.of(self.scene.bodies, host.rest[host.rigid_bodies.centers])
 
     @property
     def contact_scales(self) -> ContactScales | None:

@@ -204,6 +204,7 @@ class Recorder:
             attributes=attributes,
             obstacles=model.obstacles,
             contact_scales=model.contact_scales if self._contacts else None,
+            bodies=model.rigid_bodies,
         )
 
     def __enter__(self) -> Recorder:
@@ -257,8 +258,9 @@ class Recorder:
                 if self._directors:
                     shape = (self._model.worlds, np.shape(state.points())[-2])
                     fields = fields | {"director": directors_at_points(self._model.curves, state.directors(), shape)}
-                bodies_and_contacts = (state.obstacle_points(), contacts)
-                self._show(time, state.points(), velocities, fields | self._colors(state), *bodies_and_contacts)
+                poses = state.body_poses() if self._model.bodies else None
+                fields = fields | self._colors(state)
+                self._show(time, state.points(), velocities, fields, state.obstacle_points(), contacts, poses)
         except OSError as error:
             self._abandon()
             raise self._described(error) from error
@@ -336,7 +338,7 @@ class Recorder:
                 if self._directors and reader.directors is not None:
                     shape = (self._model.worlds, reader.points.shape[-2])
                     fields["director"] = directors_at_points(reader.curves, reader.directors[frame], shape)
-                self._show(reader.time[frame], reader.points[frame], velocities, fields, *_others(reader, frame))
+                self._show(reader.time[frame], reader.points[frame], velocities, fields, **_others(reader, frame))
 
     def _fields_of(self, state) -> dict[str, np.ndarray]:
         """Return the fields of a state by name, (worlds, points) or (worlds, triangles)."""
@@ -365,6 +367,7 @@ class Recorder:
         fields: Mapping | None = None,
         obstacles: np.ndarray | None = None,
         contacts: Contacts | None = None,
+        body_poses: np.ndarray | None = None,
     ) -> None:
         """Add a frame of all worlds to the scene; undefined fields are 0."""
         velocities = None if velocities is None else np.reshape(velocities, (-1, 3))
@@ -378,8 +381,9 @@ class Recorder:
             velocities=velocities,
             scalars=at_points,
             triangle_scalars=fields,
-            obstacles=None if obstacles is None else np.reshape(obstacles, (-1, 3)),
+            obstacles=obstacles,
             contacts=contacts,
+            body_poses=body_poses,
         )
 
 
@@ -396,9 +400,10 @@ def _same_attributes(first: Mapping, second: Mapping) -> bool:
     return first.keys() == second.keys() and all(np.array_equal(first[name], second[name]) for name in first)
 
 
-def _others(reader, frame: int) -> tuple[np.ndarray | None, Contacts | None]:
-    """Return nodes of moving obstacles and contacts of a frame, None where not recorded."""
-    return tuple(each if each is None else each[frame] for each in (reader.obstacle_points, reader.contacts))
+def _others(reader, frame: int) -> dict[str, np.ndarray | Contacts]:
+    """Return recorded nodes of moving obstacles, contacts and poses of rigid bodies in a frame."""
+    fields = {"obstacles": reader.obstacle_points, "contacts": reader.contacts, "body_poses": reader.body_poses}
+    return {name: frames[frame] for name, frames in fields.items() if frames is not None}
 
 
 def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False, revolve: int = 0) -> None:
@@ -448,6 +453,7 @@ def _export(trajectory, path, fps: float | None, tube: bool, revolve: int) -> No
         options = {
             "obstacles": reader.obstacles,
             "contact_scales": reader.contact_scales if reader.contacts is not None else None,
+            "bodies": reader.rigid_bodies,
         }
         options = {} if revolved else options | {"attributes": reader.attributes}
         with CurvesWriter(path, shapes, fps=fps or frame_rate(spacing), tube=tube, **options) as writer:
@@ -463,9 +469,7 @@ def _export(trajectory, path, fps: float | None, tube: bool, revolve: int) -> No
                     if reader.directors is None
                     else {"director": directors_at_points(reader.curves, reader.directors[frame], shape)}
                 )
-                nodes, contacts = _others(reader, frame)
-                nodes = None if nodes is None else nodes.reshape(-1, 3)
-                writer.write(time, points, velocities=velocities, scalars=directors, obstacles=nodes, contacts=contacts)
+                writer.write(time, points, velocities=velocities, scalars=directors, **_others(reader, frame))
 
 
 def frame_rate(dt: float) -> float:

@@ -561,7 +561,8 @@ def settings_to_resume(directory: Path, asked: Mapping[str, object] | None = Non
     if not {*RUN_SETTINGS} <= stored.keys():
         raise InputError(f"{path} is not of `simulate`: resume it where it was made, with Recorder(resume=True)")
     settings = {name: stored[name] for name in (*RUN_SETTINGS, "duration") if name in stored}
-    recorded = {name for name in fields if name not in ("points", "obstacle_points") and "/" not in name}
+    always = ("points", "obstacle_points", "body_poses")
+    recorded = {name for name in fields if name not in always and "/" not in name}
     for name, value in (asked or {}).items():
         recorded_value = settings.get(name, recorded)
         if value is not None and value != recorded_value:

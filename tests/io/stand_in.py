@@ -83,6 +83,7 @@ class Model:
     worlds: int = 1
     scene: object = None
     bodies: tuple = ()
+    rigid_bodies: object = None
 
     def parameters(self) -> dict[str, np.ndarray]:
         return {"bend_stiffness": np.array([1e-3, 2e-3]), "density": np.array(1000.0)}
