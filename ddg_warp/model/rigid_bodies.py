@@ -85,29 +85,31 @@ class BodyState:
     angular_velocity: Floats
 
 
-def body_state(state, index: int) -> BodyState:
-    """Return pose and rates of a rigid body in a `State`."""
+def body_states(state, chosen=slice(None)) -> BodyState:
+    """Return poses and rates of rigid bodies in a `State`, arrays (worlds, bodies, ...), of all or chosen ones."""
     model, host = state.model, state.model.coupled.host.rigid_bodies
     of_worlds = (array.numpy().astype(float) for array in (state.coupled.rotation, state.coupled.momentum))
-    rotation, momentum = (v.reshape(model.worlds, len(host), *v.shape[1:])[:, index] for v in of_worlds)
+    rotation, momentum = (v.reshape(model.worlds, len(host), *v.shape[1:])[:, chosen] for v in of_worlds)
     blocks = (array.numpy().astype(float).reshape(model.worlds, -1, 3) for array in (state.coupled.q, state.coupled.v))
-    position, velocity = (values[:, host.centers[index]] for values in blocks)
-    rates = np.einsum("wji,wj->wi", rotation, momentum) / host.moments[index]
-    values = position, rotation @ host.axes[index].T, velocity, np.einsum("wij,wj->wi", rotation, rates)
-    return BodyState(*(value[0] if model.worlds == 1 else value for value in values))
+    position, velocity = (values[:, host.centers[chosen]] for values in blocks)
+    rates = np.einsum("wbji,wbj->wbi", rotation, momentum) / host.moments[chosen]
+    to_rest = host.axes[chosen].transpose(0, 2, 1)
+    return BodyState(position, rotation @ to_rest, velocity, np.einsum("wbij,wbj->wbi", rotation, rates))
+
+
+def body_state(state, index: int) -> BodyState:
+    """Return pose and rates of a rigid body in a `State`."""
+    values = vars(body_states(state, [index])).values()
+    return BodyState(*(value[0, 0] if state.model.worlds == 1 else value[:, 0] for value in values))
 
 
 def shape_points(state) -> np.ndarray:
     """Return the nodes of all shapes of rigid bodies in a `State` (worlds, M, 3) [m], in the order of bodies."""
-    model, host, values = state.model, state.model.coupled.host.rigid_bodies, []
-    for index, body in enumerate(model.scene.bodies):
-        if not body.shapes:
-            continue
-        pose = body_state(state, index)
-        position, rotation = pose.position.reshape(-1, 1, 3), pose.rotation.reshape(-1, 3, 3)
-        arms = np.concatenate([shape.points for shape in body.shapes]) - model.coupled.host.rest[host.centers[index]]
-        values.append(position + arms @ rotation.transpose(0, 2, 1))
-    return np.concatenate(values, axis=1)
+    host, poses = state.model.coupled.host, body_states(state)
+    shapes = [(index, shape.points) for index, body in enumerate(state.model.scene.bodies) for shape in body.shapes]
+    owner = np.repeat([index for index, _ in shapes], [len(points) for _, points in shapes])
+    arms = np.concatenate([points for _, points in shapes]) - host.rest[host.rigid_bodies.centers[owner]]
+    return poses.position[:, owner] + np.einsum("wnij,nj->wni", poses.rotation[:, owner], arms)
 
 
 def body_energies(state) -> tuple[np.ndarray, np.ndarray]:

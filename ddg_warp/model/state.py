@@ -12,7 +12,7 @@ from ddg_warp import device_arrays as arrays
 from ddg_warp.capture_lock import launches
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import polyline
-from ddg_warp.model.rigid_bodies import BodyState, body_state, shape_points
+from ddg_warp.model.rigid_bodies import BodyState, body_state, body_states, shape_points
 from ddg_warp.scene.descriptions import Dynamics
 from ddg_warp.scene.handle import BODY, OBSTACLE, Handle, named
 from ddg_warp.typing import Array, Bools, Device, Floats, Names
@@ -309,9 +309,9 @@ class State:
 
     def body_poses(self) -> Floats:
         """Return rotation and position of all rigid bodies, [R | x], (bodies, 3, 4) or (worlds, bodies, 3, 4); see `BodyState`."""
-        poses = [body_state(self, index) for index in range(len(self.model.bodies))]
-        values = [np.concatenate([pose.rotation, pose.position[..., None]], axis=-1) for pose in poses]
-        return np.stack(values, axis=0 if self.model.worlds == 1 else 1)
+        poses = body_states(self)
+        values = np.concatenate([poses.rotation, poses.position[..., None]], axis=-1)
+        return values[0] if self.model.worlds == 1 else values
 
     def poses(self) -> Floats | None:
         """Return poses of grips (grips, 6) or (worlds, grips, 6) in the order of `model.grips`; None without."""
