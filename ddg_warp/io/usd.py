@@ -87,6 +87,7 @@ class CurvesWriter:
         self._rows = shapes.worlds * shapes.point_count
         color_by = ColorBy(*color_by) if color_by else None
         self._prims: list[PointsPrim | BodyPrim] = []
+        numbers: dict[str, int] = {}
         kept = {name: np.tile(np.asarray(values), shapes.worlds) for name, values in (attributes or {}).items()}
         for name, values in kept.items():
             if values.shape != shapes.curves.counts.shape:
@@ -95,21 +96,22 @@ class CurvesWriter:
                     f"attribute {name!r} has {len(values) // shapes.worlds} values for {rods} rods; give one a rod"
                 )
         if len(shapes.curves.counts):
-            self._prims += _define_rods(self._stage, shapes, colors, color_by, TubesPrim if tube else CurvesPrim, kept)
+            kind = TubesPrim if tube else CurvesPrim
+            self._prims += _define_rods(self._stage, shapes, colors, color_by, kind, kept, numbers)
         if shapes.surfaces is not None:
-            self._prims += _define_surfaces(self._stage, shapes, color_by)
+            self._prims += _define_surfaces(self._stage, shapes, color_by, numbers)
         alone = 0 if obstacles is None else len(obstacles) - (0 if bodies is None else int(bodies.shapes.sum()))
         for k in range(alone):
             for world in range(shapes.worlds if obstacles.moved[k] else 1):
-                path = _free_path(self._stage, str(obstacles.names[k]))
+                path = _free_path(self._stage, str(obstacles.names[k]), numbers)
                 self._prims.append(ObstaclePrim(self._stage, path, obstacles, k, world))
         if bodies is not None:
             UsdPhysics.SetStageKilogramsPerUnit(self._stage, 1.0)
             for k, world in np.ndindex(len(bodies), shapes.worlds):
-                path = _free_path(self._stage, str(bodies.names[k]))
+                path = _free_path(self._stage, str(bodies.names[k]), numbers)
                 self._prims.append(BodyPrim(self._stage, path, bodies, k, obstacles, world))
         if contact_scales is not None:
-            self._prims.append(ContactsPrim(self._stage, _free_path(self._stage, "contacts"), contact_scales))
+            self._prims.append(ContactsPrim(self._stage, _free_path(self._stage, "contacts", numbers), contact_scales))
         self._unsaved = _size_of_defaults(self._stage)
 
     def __enter__(self) -> CurvesWriter:
@@ -251,7 +253,9 @@ def _drawable(curves) -> Shapes:
     return Shapes.of(curves)
 
 
-def _define_rods(stage: Usd.Stage, shapes: Shapes, colors, color_by, kind, attributes: Mapping) -> list[PointsPrim]:
+def _define_rods(
+    stage: Usd.Stage, shapes: Shapes, colors, color_by, kind, attributes: Mapping, numbers: dict[str, int]
+) -> list[PointsPrim]:
     """Define one prim for each batch; two for open and closed rods, because USD wraps all curves of a prim alike."""
     curves = shapes.curves
     if colors is not None and len(colors) == len(curves.counts):
@@ -265,28 +269,28 @@ def _define_rods(stage: Usd.Stage, shapes: Shapes, colors, color_by, kind, attri
                 names, radius = curves.names[rods], curves.radius[mine]
                 part = Curves(curves.counts[rods], curves.closed[rods], radius, names, curves.batch[rods])
                 color = np.array(PALETTE[batch % len(PALETTE)]) if colors is None else np.asarray(colors)[mine]
-                path = _free_path(stage, str(names[0]))
+                path = _free_path(stage, str(names[0]), numbers)
                 prims.append(kind(stage, path, part, shapes.rows[mine], color, color_by))
                 prims[-1].add_attributes({name: values[rods] for name, values in attributes.items()})
     return prims
 
 
-def _define_surfaces(stage: Usd.Stage, shapes: Shapes, color_by) -> list[PointsPrim]:
+def _define_surfaces(stage: Usd.Stage, shapes: Shapes, color_by, numbers: dict[str, int]) -> list[PointsPrim]:
     """Define one prim for each surface, with colors after the rods' colors in the palette."""
     surfaces, batches = shapes.surfaces, len(np.unique(shapes.curves.batch))
     of_a_world = len(surfaces.names) // shapes.worlds
     prims = []
     for k, (part, name) in enumerate(zip(surfaces.parts(), surfaces.names, strict=True)):
         color = np.array(PALETTE[(batches + k % of_a_world) % len(PALETTE)])
-        prims.append(SurfacePrim(stage, _free_path(stage, str(name)), surfaces, part, color, color_by))
+        prims.append(SurfacePrim(stage, _free_path(stage, str(name), numbers), surfaces, part, color, color_by))
     return prims
 
 
-def _free_path(stage: Usd.Stage, name: str) -> str:
-    """Return a path below /World from a name, with a number if it is taken."""
-    base = path = f"/World/{Tf.MakeValidIdentifier(name)}"
-    number = 1
-    while stage.GetPrimAtPath(path):
+def _free_path(stage: Usd.Stage, name: str, numbers: dict[str, int]) -> str:
+    """Return a path below /World from a name, with a number if it is taken; `numbers` keeps the last number by path."""
+    base = f"/World/{Tf.MakeValidIdentifier(name)}"
+    number = numbers.get(base, 1)
+    while stage.GetPrimAtPath(path := base if number == 1 else f"{base}_{number}"):
         number += 1
-        path = f"{base}_{number}"
+    numbers[base] = number
     return path
