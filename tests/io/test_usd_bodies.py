@@ -1,5 +1,10 @@
 """Rigid bodies in USD: transforms above constant shapes, in recordings, resumed runs and exports."""
 
+import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import h5py
@@ -169,6 +174,39 @@ def test_resumed_run_equals_uninterrupted_run(device, tmp_path):
     assert_shows(stages[1], model, states)
     first, second = (stage.GetRootLayer().ExportToString() for stage in stages)
     assert first == second
+
+
+def test_killed_run_resumes(device, tmp_path):
+    """A run killed while it records continues as if uninterrupted."""
+    code = f"from test_usd_bodies import run; run({str(device)!r}, {str(tmp_path / 'killed')!r}, 10**6)"
+    path = tmp_path / "killed" / "trajectory.h5"
+    root, here = Path(__file__).resolve().parents[2], Path(__file__).parent
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), str(here)])}
+    with subprocess.Popen([sys.executable, "-c", code], env=environment) as child:
+        while child.poll() is None and frame_count(path) < 6:
+            time.sleep(0.05)
+        child.send_signal(signal.SIGKILL)
+    assert child.returncode == -signal.SIGKILL
+    steps = frame_count(path) + 3
+    assert validate(tmp_path / "killed" / "scene.usdc") == []
+    model, states = run(device, tmp_path / "straight", steps)
+    run(device, tmp_path / "killed", steps, resume=True)
+    with (
+        TrajectoryReader(path) as resumed,
+        TrajectoryReader(tmp_path / "straight" / "trajectory.h5") as uninterrupted,
+    ):
+        for name in ("time", "points", "obstacle_points", "body_poses"):
+            np.testing.assert_array_equal(getattr(resumed, name)[:], getattr(uninterrupted, name)[:], err_msg=name)
+    assert validate(tmp_path / "killed" / "scene.usdc") == []
+    assert_shows(Usd.Stage.Open(str(tmp_path / "killed" / "scene.usdc")), model, states)
+
+
+def frame_count(path) -> int:
+    """Return the number of frames of a trajectory, 0 without a file."""
+    if not path.is_file():
+        return 0
+    with TrajectoryReader(path) as reader:
+        return len(reader)
 
 
 def test_other_bodies_are_refused(device, tmp_path):
