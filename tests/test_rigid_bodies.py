@@ -518,7 +518,7 @@ def test_joints_transmit_weights():
 
 
 def test_pins_balance_inertia():
-    """A body on a string of length l at the rate w pulls its pin by m l w^2; the motor's torque is I times its acceleration."""
+    """The pin of a body on a string of length l at the rate w has the force m l w^2; a motor has the torque I a."""
     scene = ddg.Scene(gravity=(0, 0, 0))
     body = scene.add_body(mass=2.0, inertia=(1e-2,) * 3, center=(0.5, 0, 0), angular_velocity=(0, 0, 3.0))
     scene.hinge(body, point=(0, 0, 0), axis=(0, 0, 1))

@@ -31,7 +31,7 @@ class Bodies:
 
     @classmethod
     def of(cls, bodies, origin: np.ndarray) -> Bodies:
-        """Return the description of rigid bodies of a scene with the rest positions of their poses."""
+        """Return the description of a scene's rigid bodies with the rest positions of all poses."""
         return cls(
             names=np.array([body.name for body in bodies], object),
             mass=np.array([body.mass for body in bodies], float),

@@ -242,7 +242,7 @@ class Model:
 
     @one_at_a_time
     def joint_wrenches(self, state: State, factor: float = 1.0) -> "JointWrenches":
-        """Return the wrench of every joint of rigid bodies on its second body in an equilibrium, about the point of the joint.
+        """Return the equilibrium wrench of every joint of rigid bodies on the second body, about the point of the joint.
 
         A joint with the world acts on the body. `Integrator.joint_wrenches` is for a step, with inertia.
 

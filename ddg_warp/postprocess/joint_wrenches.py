@@ -52,7 +52,7 @@ def of_equilibrium(model: "Model", state: "State", factor: float) -> JointWrench
 
 
 def pinned_masses(model: "Model") -> Floats:
-    """Return the masses of bodies that turn about a pin, zero for others (bodies, 1) [kg]."""
+    """Return the masses of bodies that rotate about a pin, zero for others (bodies, 1) [kg]."""
     host = model.coupled.host
     return np.where(host.rigid_bodies.pinned, host.mass[host.rigid_bodies.origins, 0], 0.0)[:, None]
 
@@ -61,7 +61,7 @@ def joint_wrenches(model: "Model", state: "State", force: Floats, moment: Floats
     """Return the force on the second body of every joint, and the moment about the point of the joint.
 
     Args:
-        force, moment: sum of all forces on every body but those of its pin, inertia included (worlds, bodies, 3). The pin of a body
+        force, moment: sum of all forces on every body except the forces of the pin, inertia included (worlds, bodies, 3). The pin of a body
             that is joined to the world balances it.
     """
     host, scene, worlds = model.coupled.host, model.scene, model.worlds
@@ -90,7 +90,7 @@ def joint_wrenches(model: "Model", state: "State", force: Floats, moment: Floats
 
 
 def _damping(state: "State", joint) -> Floats:
-    """Return the damping torque of a hinge against its rate, on the second body with the opposite sign (worlds, 3) [N m]."""
+    """Return the damping torque of a hinge, opposite to the hinge's rate, with the sign of the first body (worlds, 3) [N m]."""
     bodies = [None if body < 0 else state.body(body) for body in (joint.first, joint.second)]
     rates = [np.zeros(3) if body is None else body.angular_velocity for body in bodies]
     axis = np.atleast_2d(bodies[1].rotation @ joint.axis)

@@ -41,7 +41,7 @@ def bodies_type(real):
     `origins`, `spins`, `carried`, `owner`, `starts`: see `ddg_warp.compile.coupled.rigid_bodies`. `y`, `derivative`: y and D of
     carried nodes (W C,). `inertia`: gamma P I P^T (W B,). `force`, `moment`: of controls, at the centre of mass (W B,). `center`:
     carried node that is the centre of mass, -1 for the origin (B,). `sum_force`, `sum_moment`: sums of all forces on bodies, inertia
-    included, with those along fixed dofs, written by the residual (W B,).
+    included, with the forces along fixed dofs, written by the residual (W B,).
     """
     V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
 

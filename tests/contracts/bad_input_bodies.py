@@ -54,7 +54,7 @@ def touching(shape, **options):
     return scene.build(DEVICE)
 
 
-each("bodies", "shapes", [3.0, "ball", [3.0], ddg.Box], add, "add_body", "is no body", "closed Mesh")
+each("bodies", "shapes", [3.0, "ball", [3.0]], add, "add_body", "is no body", "closed Mesh")
 each("bodies", "density", [0.0, -1.0, NAN, INF, "heavy", (1.0, 2.0)], lambda v: add(density=v), "add_body: density", "kg/m^3")
 each("bodies", "mass", [0.0, -1.0, NAN, INF, "heavy"], lambda v: add(density=None, mass=v), "add_body: mass", "kg")
 each("bodies", "center", [3.0, (0.0, 1.0), (0.0, 0.0, NAN), "here"], lambda v: plain(center=v), "add_body: center", "three finite")
@@ -69,6 +69,7 @@ each("bodies", "name", [3, "", None], lambda v: add(name=v), "add_body: name", "
 refuse("bodies", {
     "density and mass": (lambda: add(mass=1.0), "add_body", "either density or mass"),
     "no mass": (lambda: add(density=None), "add_body", "either density or mass"),
+    "constructor of a shape": (lambda: add(ddg.Box), "add_body", "is no body"),
     "no shapes": (lambda: add(None), "add_body", "without shapes", "mass, inertia and center"),
     "no inertia": (lambda: plain(inertia=None), "add_body", "without shapes"),
     "center of shapes": (lambda: add(center=(0.0, 0.0, 1.0)), "add_body", "center and inertia belong to a mass"),

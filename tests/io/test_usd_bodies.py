@@ -111,7 +111,7 @@ def extent(stage, path: str, code: float) -> np.ndarray:
 
 @pytest.mark.parametrize("worlds", [1, 2])
 def test_transforms_place_bodies_and_shapes(device, tmp_path, worlds):
-    """Transforms and shapes of a run and of its export equal the states; obstacles stay meshes."""
+    """Recorded and exported transforms and shapes equal the states; obstacles stay meshes."""
     model, states = run(device, tmp_path, 5, worlds)
     export_usd(tmp_path / "trajectory.h5", tmp_path / "export.usda")
     for name in ("scene.usdc", "export.usda"):
@@ -177,11 +177,11 @@ def test_resumed_run_equals_uninterrupted_run(device, tmp_path):
 
 
 def test_killed_run_resumes(device, tmp_path):
-    """A run killed while it records continues as if uninterrupted."""
+    """A run that is killed while recording continues as if uninterrupted."""
     code = f"from test_usd_bodies import run; run({str(device)!r}, {str(tmp_path / 'killed')!r}, 10**6)"
     path = tmp_path / "killed" / "trajectory.h5"
-    root, here = Path(__file__).resolve().parents[2], Path(__file__).parent
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), str(here)])}
+    root, folder = Path(__file__).resolve().parents[2], Path(__file__).parent
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), str(folder)])}
     with subprocess.Popen([sys.executable, "-c", code], env=environment) as child:
         while child.poll() is None and frame_count(path) < 6:
             time.sleep(0.05)

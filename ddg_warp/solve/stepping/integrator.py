@@ -518,7 +518,7 @@ class Integrator:
         return self.watched_wrenches.values()
 
     def joint_wrenches(self, state: State) -> "JointWrenches":
-        """Return the wrench of every joint of rigid bodies on its second body in the last step, about the point of the joint.
+        """Return the last step's wrench of every joint of rigid bodies on the second body, about the point of the joint.
 
         A joint with the world acts on the body. Wrenches hold motors, damping, stops, and the inertia that a pin balances; see
         `JointWrenches`. By the midpoint rule a pin balances the forces of the middle of the step. Reads from the device.
