@@ -61,7 +61,7 @@ def joint_wrenches(model: "Model", state: "State", force: Floats, moment: Floats
     """Return the force on the second body of every joint, and the moment about the point of the joint.
 
     Args:
-        force, moment: sum of all forces on every body except the forces of the pin, inertia included (worlds, bodies, 3). The pin of a body
+        force, moment: sum of all forces on every body except its pin's, inertia included (worlds, bodies, 3). The pin of a body
             that is joined to the world balances it.
     """
     host, scene, worlds = model.coupled.host, model.scene, model.worlds
