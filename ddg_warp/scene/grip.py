@@ -45,8 +45,8 @@ class Grip:
         Args:
             position: of the pivot (..., 3) [m].
             quaternion: unit quaternion (w, x, y, z) relative to rest.
-            near: earlier pose (..., 6), whose number of revolutions is kept: rotation vectors of a continuous rotation are continuous. By
-                default rotation vectors are at most pi long.
+            near: earlier pose (..., 6), whose number of revolutions is kept: rotation vectors of a continuous rotation are continuous.
+                By default rotation vectors are at most pi long.
 
         Raises:
             SceneError: a shape does not fit, or a quaternion is not of unit length to 1e-3.
