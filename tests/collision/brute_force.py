@@ -92,10 +92,11 @@ def admissible_pairs(shapes: CollisionMesh, first: int, second: int) -> tuple[np
     fits &= ~np.isin(lower * len(shapes.names) + upper, shapes.ignored)
     still = np.array(sorted(shapes.obstacle), int)
     fits &= ~(np.isin(lower, still) & np.isin(upper, still))
-    if second == BALLS:
+    if second == BALLS and first == 2:
         fits &= span_a[:, 3:] >= 0.0
     if first == second:
         fits &= np.arange(len(nodes_a))[:, None] < np.arange(len(nodes_b))
+    if first == second != BALLS:
         middle, half = 0.5 * (span_a[:, 0] + span_a[:, 1]), 0.5 * (span_a[:, 1] - span_a[:, 0])
         along = np.abs(middle[:, None] - middle)
         loop = span_a[:, 2]
@@ -109,6 +110,8 @@ def distances(shapes: CollisionMesh, x: np.ndarray, first: int, second: int, i, 
     nodes_a, radius_a, *_ = shapes.primitives(first)
     nodes_b, radius_b, *_ = shapes.primitives(second)
     corners = [*np.moveaxis(x[nodes_a[i]], 1, 0), *np.moveaxis(x[nodes_b[j]], 1, 0)]
+    if first == second == BALLS:
+        return np.linalg.norm(corners[0] - corners[1], axis=-1), radius_a[i] + radius_b[j]
     if second == BALLS:
         return point_edge(corners[2], *corners[:2]), radius_a[i] + radius_b[j]
     return (edge_edge if first == 2 else point_triangle)(*corners), radius_a[i] + radius_b[j]

@@ -74,6 +74,8 @@ class BroadPhase:
             raise SceneError(
                 f"positions of {worlds} world(s) of {nodes} nodes are {worlds * nodes} vectors of 3, not {x.shape} of {x.dtype}"
             )
+        if not shapes.names:
+            raise SceneError("a contact search has no objects; add rods, shells or balls")
         self.shapes, self.worlds = shapes, worlds
         self.search_distance, self.margin = float(search_distance), float(margin)
         self.device, real = x.device, x.dtype._wp_scalar_type_
