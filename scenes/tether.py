@@ -116,5 +116,5 @@ def _checks(result, series, masses) -> list[ddg.Check]:
 
 
 def benchmark() -> ddg.bench.Study:
-    """Study the angular momentum over steps."""
-    return ddg.bench.Study({"dt": (2e-2, 1e-2, 5e-3)}, "relative change of angular momentum")
+    """Study the force in the cable over steps."""
+    return ddg.bench.Study({"dt": (2e-2, 1e-2, 5e-3)}, NAMES[0])
