@@ -11,7 +11,9 @@ Wheels that rotate by an angle p and do not slip travel R p along the ground. At
 import numpy as np
 
 import ddg_warp as ddg
+from ddg_warp.geometry import meshes
 from ddg_warp.run.check import once_reached
+from ddg_warp.scene.obstacles import MESH
 from ddg_warp.scenes import _bodies, _many_rods
 
 WHEEL, WIDTH, ROUND = 0.05, 0.025, 2e-3  # m, radius and width of a wheel, and radius of its rounded surface
@@ -23,6 +25,7 @@ RANGE, STIFFNESS = 1e-3, 5e4  # m, N/m, of contact
 SLIP = 5e-3  # m/s, stick threshold of friction
 BUMP = 0.03  # m, radius of the bumps
 GRAVITY = 9.81  # m/s^2
+GREY, BLUE = 0.85, (0.35, 0.5, 0.75)  # of the ground and of the car in pictures
 STANDS, STARTS = 0.6, 1.0  # s: the motor starts, and reaches its speed
 NAMES = ("sinking of the springs at rest [m]", "travel over that of wheels that do not slip", "bumps passed")
 
@@ -91,14 +94,19 @@ class Drive:
 
 
 def observe(model, state) -> dict[str, float]:
-    """Return `_bodies.observe` with position and height of the chassis [m], its height above the axles, and its pitch [rad]."""
+    """Return `_bodies.observe` with position of the chassis [m], height above the axles, pitch [rad], and positions of axles."""
     chassis = state.body("chassis")
-    axles = np.mean([state.body(f"axle {side}").position[2] for side in (-1, 1)])
+    axles = [state.body(f"axle {side}").position for side in (-1, 1)]
     return _bodies.observe(model, state) | {
         "x": float(chassis.position[0]),
         "z": float(chassis.position[2]),
-        "above": float(chassis.position[2] - axles),
+        "above": float(chassis.position[2] - np.mean(axles, axis=0)[2]),
         "pitch": float(-np.arcsin(chassis.rotation[2, 0])),
+        **{
+            f"{name} {axis}": float(axle[k])
+            for name, axle in zip(("rear", "front"), axles, strict=True)
+            for k, axis in ((0, "x"), (2, "z"))
+        },
     }
 
 
@@ -130,9 +138,35 @@ def _driving(result) -> list[ddg.Check]:
 
 
 def picture(result, frames) -> dict:
-    """Draw the car at the start, on the bumps and behind them."""
+    """Draw the car at the start, on the bumps and behind them, on a strip of the ground."""
     times = sorted(frames)
-    return {"points_by_time": {t: frames[t] for t in (times[0], times[3], times[5])}}
+    end = result.series["x"][-1] + BASE + 2.0 * WHEEL
+    strip, cells = meshes.rectangle(160, 6, (end + BASE + 2.0 * WHEEL, 3.0 * TRACK))
+    strip = strip - [BASE + 2.0 * WHEEL, 1.5 * TRACK, 0.0]
+    for bump in result.scene.obstacles[1:]:
+        x, _, z = bump.shape.points[0]
+        strip[:, 2] = np.maximum(strip[:, 2], z + np.sqrt(np.maximum(BUMP**2 - (strip[:, 0] - x) ** 2, 0.0)))
+    ground = [(strip, cells)]
+    bodies = {}
+    for time in (times[0], times[3], times[5]):
+        parts = [*_car(result, time), *(ground if time == times[0] else [])]
+        colors = [np.full((len(cells), 3), GREY if k > 4 else BLUE) for k, (_, cells) in enumerate(parts)]
+        bodies[time] = *_many_rods.joined(*parts), np.concatenate(colors)
+    return {"points_by_time": {t: frames[t] for t in bodies}, "bodies": bodies}
+
+
+def _car(result, time: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the surfaces of chassis and wheels at a time [s], from the observed numbers."""
+    box, *shapes = (body.shapes[0] for body in result.scene.bodies)
+    wheels = [(shape.points, shape.cells) for shape in shapes if shape.kind == MESH]
+    values = {name: result.at(time, name) for name in ("x", "z", "pitch", "rear x", "rear z", "front x", "front z")}
+    chassis = (box.points - box.points.mean(0)) @ _bodies.tilted(values["pitch"]).T
+    parts = [(chassis + [values["x"], 0.0, values["z"]], box.cells)]
+    for points, cells in wheels:
+        middle = 0.5 * (points.min(0) + points.max(0))
+        axle = "rear" if middle[0] < 0.0 else "front"
+        parts.append((points - middle + [values[f"{axle} x"], middle[1], values[f"{axle} z"]], cells))
+    return parts
 
 
 def benchmark() -> ddg.bench.Study:
