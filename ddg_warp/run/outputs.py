@@ -76,7 +76,8 @@ def draw(directory: Path, module, result, shapes: int = 6) -> None:
         options.setdefault("chart", result.path)
         if options.get("side_by_side"):
             options |= {"fixed": None, "loads": None}
-        rods_picture(reader, path=directory / "picture.png", title=title, **options)
+        if count or {"bodies", "obstacles"} & options.keys():
+            rods_picture(reader, path=directory / "picture.png", title=title, **options)
     if result.path is not None:
         path_plot(result.path, directory / "path.png", title, unit)
     if result.learned is not None:

@@ -16,6 +16,7 @@ import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader
 from ddg_warp.io.usd_check import validate
+from ddg_warp.run.cli import main
 from ddg_warp.run.recorder import export_usd
 
 DT, RADIUS = 0.01, 2e-3
@@ -249,3 +250,29 @@ def test_bodies_without_shapes_and_rods_are_recorded(device, tmp_path):
     body.AddScaleOp().Set(Gf.Vec3f(1.0, 2.0, 1.0))
     stage.GetRootLayer().Export(str(tmp_path / "stretched.usdc"))
     assert any("the transform is not rigid" in problem for problem in validate(tmp_path / "stretched.usdc"))
+
+
+@pytest.mark.parametrize("shape", ["ddg.Sphere((0.0, 0.0, 0.0), 0.1)", "None"])
+def test_commands_of_bodies_alone(device, tmp_path, shape):
+    """A run without rods, of a body with or without a shape, is drawn, resumed with its fields, and exported."""
+    inertia = ", inertia=(1.0, 2.0, 2.5), center=(0.0, 0.0, 0.0)" if shape == "None" else ""
+    (tmp_path / "top.py").write_text(
+        f"""import ddg_warp as ddg
+
+
+def build() -> ddg.Scene:
+    scene = ddg.Scene(analysis=ddg.Dynamics(dt=0.01, duration=0.04))
+    scene.add_body({shape}, mass=1.0{inertia}, angular_velocity=(1.0, 0.1, 0.0))
+    return scene
+"""
+    )
+    scene, out = str(tmp_path / "top.py"), tmp_path / "out"
+    options = ["--fields", "velocities", "--device", str(device)]
+    assert main(["run", scene, "--out", str(out), *options]) == 0
+    assert main(["run", scene, "--resume", str(out), "--duration", "0.06", *options]) == 0
+    assert main(["export", str(out), "--to", str(tmp_path / "export.usda")]) == 0
+    assert (out / "picture.png").exists() == (shape != "None")
+    for path in (out / "scene.usdc", tmp_path / "export.usda"):
+        assert validate(path) == []
+        stage = Usd.Stage.Open(str(path))
+        assert len(UsdGeom.Xform(stage.GetPrimAtPath("/World/body")).GetTimeSamples()) == 7
