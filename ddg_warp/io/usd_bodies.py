@@ -15,8 +15,8 @@ from ddg_warp.io.usd_materials import bind_preview_surface
 from ddg_warp.io.usd_prims import HEADER, Frame, define_mesh, vectors
 from ddg_warp.scene.obstacles import BALL, CAPSULE
 
-POSE = 40  # size of a translation and a quaternion [bytes]
-UP = Gf.Vec3d(0.0, 0.0, 1.0)  # axis of a Capsule
+DOUBLE = UsdGeom.XformOp.PrecisionDouble  # USD takes angles from arc cosines, which lose small ones of float32
+POSE = 56  # size of a translation and a quaternion [bytes]
 
 
 class BodyPrim:
@@ -38,14 +38,14 @@ class BodyPrim:
         self.unsaved = 0
         """Upper bound of the size of unsaved values [bytes]."""
         body = UsdGeom.Xform.Define(stage, path)
-        self._translate, self._orient = body.AddTranslateOp(), body.AddOrientOp()
-        self._last = Gf.Quatf(1.0)
+        self._translate, self._orient = body.AddTranslateOp(), body.AddOrientOp(DOUBLE)
+        self._last = Gf.Quatd(1.0)
         UsdPhysics.RigidBodyAPI.Apply(body.GetPrim()).CreateKinematicEnabledAttr(True)
         mass = UsdPhysics.MassAPI.Apply(body.GetPrim())
         mass.CreateMassAttr(float(bodies.mass[number]))
         mass.CreateCenterOfMassAttr(Gf.Vec3f(*map(float, bodies.center[number] - bodies.origin[number])))
         mass.CreateDiagonalInertiaAttr(Gf.Vec3f(*map(float, bodies.moments[number])))
-        mass.CreatePrincipalAxesAttr(_quaternion(bodies.axes[number]))
+        mass.CreatePrincipalAxesAttr(Gf.Quatf(_quaternion(bodies.axes[number])))
         bind_preview_surface(stage, body.GetPrim(), np.array(OBSTACLE))
         first = len(obstacles) - int(bodies.shapes[number:].sum()) if bodies.shapes[number] else 0
         for k in range(first, first + int(bodies.shapes[number])):
@@ -78,15 +78,17 @@ def _define_shape(stage: Usd.Stage, path: str, obstacles: Obstacles, k: int, ori
     shape.CreateRadiusAttr(float(obstacles.radius[k]))
     shape.AddTranslateOp().Set(Gf.Vec3d(*map(float, nodes.mean(0))))
     if kind is UsdGeom.Capsule:
-        axis = nodes[1] - nodes[0]
+        axis = (nodes[1] - nodes[0]) * (1.0 if nodes[1, 2] >= nodes[0, 2] else -1.0)  # upwards
+        length = float(np.linalg.norm(axis))
+        x, y, z = map(float, axis / length)
         shape.CreateAxisAttr(UsdGeom.Tokens.z)
-        shape.CreateHeightAttr(float(np.linalg.norm(axis)))
-        shape.AddOrientOp().Set(Gf.Quatf(Gf.Rotation(UP, Gf.Vec3d(*map(float, axis))).GetQuat()))
+        shape.CreateHeightAttr(length)
+        shape.AddOrientOp(DOUBLE).Set(Gf.Quatd(1.0 + z, -y, x, 0.0).GetNormalized())  # from the z axis
     shape.CreateExtentAttr(UsdGeom.Boundable.ComputeExtentFromPlugins(shape, Usd.TimeCode.Default()))
     return shape
 
 
-def _quaternion(rotation: np.ndarray) -> Gf.Quatf:
+def _quaternion(rotation: np.ndarray) -> Gf.Quatd:
     """Return the quaternion of a rotation matrix (3, 3)."""
     matrix = Gf.Matrix4d(Gf.Matrix3d(*map(float, rotation.T.ravel())), Gf.Vec3d(0.0))  # of row vectors
-    return Gf.Quatf(matrix.ExtractRotationQuat().GetNormalized())
+    return matrix.ExtractRotationQuat().GetNormalized()

@@ -9,7 +9,7 @@ from ddg_warp.io.paths import CurveError, MissingFileError, existing
 from ddg_warp.io.usd_read import opened
 
 EXTENT_SLACK = 1e-5  # of the extent's size: positions and extents are float32
-RIGID_SLACK = 1e-5  # of entries of R R^T: quaternions are float32
+RIGID_SLACK = 1e-5  # of entries of R R^T: quaternions may be float32
 
 
 def validate(path, outside: bool = False) -> list[str]:

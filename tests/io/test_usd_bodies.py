@@ -69,6 +69,13 @@ def placed(stage, path: str, code: float) -> tuple[np.ndarray, np.ndarray]:
     return matrix[:3, :3], matrix[:3, 3]
 
 
+def capsule_ends(stage, path: str, code: float) -> np.ndarray:
+    """Return both ends of the axis of a Capsule in the world (2, 3)."""
+    (rotation, position), prim = placed(stage, path, code), UsdGeom.Capsule(stage.GetPrimAtPath(path))
+    assert prim.GetAxisAttr().Get() == "Z"
+    return position + 0.5 * prim.GetHeightAttr().Get() * np.outer([-1.0, 1.0], rotation[:, 2])
+
+
 def assert_shows(stage, model, states) -> None:
     """Assert that a stage shows the bodies of the states in all worlds."""
     paths = [["hub", "hub_2"], ["ball", "ball_2"], ["hub_3", "hub_4"], ["head", "head_2"]]
@@ -95,10 +102,9 @@ def assert_shows(stage, model, states) -> None:
                 np.testing.assert_allclose(shown, model.obstacles.points(kind, corners), rtol=0.0, atol=1e-7)
                 assert mesh.GetPointsAttr().GetNumTimeSamples() == 0
             path = f"/World/{paths[0][world]}/shape_2"
-            (rotation, position), prim = placed(stage, path, frame), UsdGeom.Capsule(stage.GetPrimAtPath(path))
-            ends = position + 0.5 * prim.GetHeightAttr().Get() * np.outer([-1.0, 1.0], rotation[:, 2])
+            ends = capsule_ends(stage, path, frame)[::-1]  # the axis of the scene is downwards
             np.testing.assert_allclose(ends, capsule, rtol=0.0, atol=1e-7)
-            assert prim.GetAxisAttr().Get() == "Z" and prim.GetRadiusAttr().Get() == ROD.radius
+            assert UsdGeom.Capsule(stage.GetPrimAtPath(path)).GetRadiusAttr().Get() == ROD.radius
             path = f"/World/{paths[1][world]}/shape_1"
             np.testing.assert_allclose(placed(stage, path, frame)[1], ball[0], rtol=0.0, atol=1e-7)
             assert UsdGeom.Sphere(stage.GetPrimAtPath(path)).GetRadiusAttr().Get() == BALL.radius
@@ -112,7 +118,7 @@ def extent(stage, path: str, code: float) -> np.ndarray:
 
 @pytest.mark.parametrize("worlds", [1, 2])
 def test_transforms_place_bodies_and_shapes(device, tmp_path, worlds):
-    """Recorded and exported transforms and shapes equal the states; obstacles stay meshes."""
+    """Transforms and shapes of a run and of its export equal the states; obstacles stay meshes."""
     model, states = run(device, tmp_path, 5, worlds)
     export_usd(tmp_path / "trajectory.h5", tmp_path / "export.usda")
     for name in ("scene.usdc", "export.usda"):
@@ -153,6 +159,21 @@ def test_quaternions_are_continuous(device, tmp_path):
     assert values[:, 0].min() < -0.4
 
 
+def test_small_rotations_are_resolved(device, tmp_path):
+    """Rotations by 1e-5 rad, and a capsule tilted by it, are resolved; quaternions in float32 would lose them."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    capsule = ddg.Capsule((0.0, 0.0, -1.0), (2e-5, 0.0, 1.0), 0.1)
+    scene.add_body(capsule, density=1.0, angular_velocity=(1e-3, 0.0, 0.0))
+    model = scene.build(device=device, precision="float64")
+    with ddg.Recorder(model, tmp_path) as recorder:
+        recorder.record(state := ddg.Integrator(model).step(model.state(), DT))
+    stage = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
+    code = stage.GetStartTimeCode()
+    np.testing.assert_allclose(placed(stage, "/World/body", code)[0], state.body(0).rotation, rtol=0.0, atol=1e-9)
+    ends = capsule_ends(stage, "/World/body/shape_1", code)
+    np.testing.assert_allclose(ends, state.obstacle_points(), rtol=0.0, atol=1e-9)
+
+
 def test_meshes_are_stored_once(device, tmp_path):
     """A mesh with 64 times the triangles enlarges the file once, not in every frame."""
     sizes = {}
@@ -177,40 +198,43 @@ def test_resumed_run_equals_uninterrupted_run(device, tmp_path):
     assert first == second
 
 
+CHILD = """
+import sys
+import ddg_warp as ddg
+from test_usd_bodies import DT, scene
+model = scene().build(device=sys.argv[1])
+integrator, state = ddg.Integrator(model), model.state()
+with ddg.Recorder(model, sys.argv[2], block=2) as recorder:
+    while True:
+        recorder.record(state)
+        print("frame", flush=True)
+        state = integrator.step(state, DT)
+"""
+
+
 def test_killed_run_resumes(device, tmp_path):
-    """A run that is killed while recording continues as if uninterrupted."""
-    code = f"from test_usd_bodies import run; run({str(device)!r}, {str(tmp_path / 'killed')!r}, 10**6)"
-    path = tmp_path / "killed" / "trajectory.h5"
-    root, folder = Path(__file__).resolve().parents[2], Path(__file__).parent
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), str(folder)])}
-    with subprocess.Popen([sys.executable, "-c", code], env=environment) as child:
-        try:
-            while child.poll() is None and frame_count(path) < 6:
-                time.sleep(0.05)
-        finally:
-            child.kill()
-    assert child.returncode == -signal.SIGKILL
-    steps = frame_count(path) + 3
-    assert validate(tmp_path / "killed" / "scene.usdc") == []
+    """A killed recording continues bitwise like an uninterrupted one."""
+    path, folders = tmp_path / "killed" / "trajectory.h5", [Path(__file__).resolve().parents[2], Path(__file__).parent]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, folders))}
+    command = [sys.executable, "-c", CHILD, str(device), str(path.parent)]
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as child:
+        lines = [child.stdout.readline() for _ in range(7)]
+        time.sleep(0.05)
+        child.send_signal(signal.SIGKILL)
+    assert lines == [b"frame\n"] * 7
+    with TrajectoryReader(path) as reader:
+        steps = len(reader) + 3
+    assert steps >= 9 and validate(path.with_name("scene.usdc")) == []
     model, states = run(device, tmp_path / "straight", steps)
-    run(device, tmp_path / "killed", steps, resume=True)
+    run(device, path.parent, steps, resume=True)
     with (
         TrajectoryReader(path) as resumed,
         TrajectoryReader(tmp_path / "straight" / "trajectory.h5") as uninterrupted,
     ):
-        for name in ("time", "points", "obstacle_points", "body_poses"):
+        for name in ("points", "obstacle_points", "body_poses"):
             np.testing.assert_array_equal(getattr(resumed, name)[:], getattr(uninterrupted, name)[:], err_msg=name)
-    assert validate(tmp_path / "killed" / "scene.usdc") == []
-    assert_shows(Usd.Stage.Open(str(tmp_path / "killed" / "scene.usdc")), model, states)
-
-
-def frame_count(path) -> int:
-    """Return the number of frames of a trajectory, 0 before the first one is written."""
-    try:
-        with TrajectoryReader(path) as reader:
-            return len(reader)
-    except (TrajectoryError, OSError):
-        return 0
+    assert validate(path.with_name("scene.usdc")) == []
+    assert_shows(Usd.Stage.Open(str(path.with_name("scene.usdc"))), model, states)
 
 
 def test_other_bodies_are_refused(device, tmp_path):
