@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ddg_warp.io.obstacles import Obstacles
+
 
 @dataclass(frozen=True)
 class Bodies:
@@ -31,7 +33,7 @@ class Bodies:
 
     @classmethod
     def of(cls, bodies, origin: np.ndarray) -> Bodies:
-        """Return the description of a scene's rigid bodies with the rest positions of all poses."""
+        """Describe rigid bodies of a scene by their data and the rest positions of their poses."""
         return cls(
             names=np.array([body.name for body in bodies], object),
             mass=np.array([body.mass for body in bodies], float),
@@ -44,3 +46,14 @@ class Bodies:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def nodes(self, obstacles: Obstacles | None, poses: np.ndarray) -> np.ndarray:
+        """Return the nodes of all shapes [m], shape (..., M, 3), for poses (..., N, 3, 4); see `State.body_poses`."""
+        count = int(self.shapes.sum())
+        if not count:
+            return np.zeros((*np.shape(poses)[:-3], 0, 3))
+        counts = obstacles.counts[-count:]
+        owner = np.repeat(np.repeat(np.arange(len(self)), self.shapes), counts)
+        arms = obstacles.rest[-counts.sum() :] - self.origin[owner]
+        of_nodes = poses[..., owner, :, :]
+        return of_nodes[..., 3] + np.einsum("...nij,nj->...ni", of_nodes[..., :3], arms)

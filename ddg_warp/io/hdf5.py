@@ -4,7 +4,7 @@
                   series/NAME (F,); with several worlds (F, B, P, 3) and (F, B, E, 3);
                   at_points/NAME (F, B P) and at_cells/NAME (F, B (R + T)) if wanted: fields of all worlds, cells are the rods
                   (without values), then the triangles; obstacle_points (F, M, 3) or (F, B, M, 3) [m], nodes of moving
-                  obstacles and of shapes of rigid bodies; body_poses (F, N, 3, 4) or (F, B, N, 3, 4), see
+                  obstacles; body_poses (F, N, 3, 4) or (F, B, N, 3, 4), see
                   `State.body_poses`; contacts/{world, objects, point, gap, force, friction} (n, ...) if wanted, pairs of all frames
                   one after the other, up to contacts/ends[f] for frame f
     /model        curves/{counts, closed, radius, names, batch}, surfaces/{triangles, first, names, thickness} if there are
@@ -111,7 +111,7 @@ class TrajectoryWriter:
         time: str = "state",
     ):
         names = ["points"] + ["velocities"] * velocities + ["directors"] * directors
-        names += ["obstacle_points"] * (model.obstacles is not None and bool(model.obstacles.moved.any()))
+        names += ["obstacle_points"] * bool(_obstacle_nodes(model))
         names += ["body_poses"] * bool(model.bodies)
         names += [f"at_points/{name}" for name in at_points] + [f"at_cells/{name}" for name in at_cells]
         self._prepare(path, model, block, names, contacts)
@@ -210,6 +210,8 @@ class TrajectoryWriter:
         if self._frames and observed.keys() != self._frames[0]["series"].keys():
             raise TrajectoryError(f"observed {sorted(observed)}, before {sorted(self._frames[0]['series'])}")
         frame = {name: np.array(getattr(state, name)()) for name in self._names if "/" not in name}
+        if "obstacle_points" in frame:
+            frame["obstacle_points"] = frame["obstacle_points"][..., : _obstacle_nodes(self._model), :]
         for name in (name for name in self._names if "/" in name):
             values = np.ravel((fields or {})[name.rpartition("/")[2]])
             frame[name] = np.concatenate([np.full(self._shape(name)[0] - len(values), np.nan), values])
@@ -277,7 +279,7 @@ class TrajectoryWriter:
             )
             return (worlds * of_a_world,)
         if name == "obstacle_points":
-            rows = int(np.count_nonzero(self._model.obstacles.moving))
+            rows = _obstacle_nodes(self._model)
         if name == "body_poses":
             shape = len(self._model.bodies), 3, 4
             return shape if worlds == 1 else (worlds, *shape)
@@ -359,6 +361,15 @@ def _other(reader: TrajectoryReader, model) -> tuple[str, str] | None:
 
 def _equal(recorded, wanted) -> bool:
     return np.array_equal(np.asarray(recorded), np.asarray(wanted))
+
+
+def _obstacle_nodes(model) -> int:
+    """Return the number of nodes of moving obstacles without shapes of rigid bodies."""
+    if model.obstacles is None:
+        return 0
+    shapes = 0 if model.rigid_bodies is None else int(model.rigid_bodies.shapes.sum())
+    moved = model.obstacles.moved[: len(model.obstacles) - shapes]
+    return int(model.obstacles.counts[: len(moved)][moved].sum())
 
 
 def _triangles(surfaces) -> np.ndarray:

@@ -190,6 +190,23 @@ def _is_virtual(item) -> bool:
     return isinstance(item, h5py.Dataset) and item.is_virtual
 
 
+class NodeFrames:
+    """Nodes of moving obstacles and of shapes of rigid bodies in all frames, placed when indexed; `shape` and `len` as an array."""
+
+    def __init__(self, reader: TrajectoryReader):
+        self._of_obstacles, self._poses = reader.obstacle_points, reader.body_poses
+        self._bodies, self._obstacles = reader.rigid_bodies, reader.obstacles
+        count = int(np.count_nonzero(reader.obstacles.moving))
+        self.shape, self.ndim = (*self._poses.shape[:-3], count, 3), self._poses.ndim - 1
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    def __getitem__(self, frames) -> np.ndarray:
+        nodes = self._bodies.nodes(self._obstacles, self._poses[frames])
+        return nodes if self._of_obstacles is None else np.concatenate([self._of_obstacles[frames], nodes], axis=-2)
+
+
 class ContactFrames:
     """`Contacts` of each frame, read when indexed by a number."""
 
@@ -229,7 +246,8 @@ class TrajectoryReader:
         curves: Rods among the points.
         surfaces: Triangles among the points, or None.
         obstacles: Obstacles as surfaces, or None.
-        obstacle_points: Nodes of moving obstacles [m], shape (F, M, 3) or (F, B, M, 3), read when indexed, or None.
+        obstacle_points: Nodes of moving obstacles, then of shapes of rigid bodies [m], shape (F, M, 3) or (F, B, M, 3), read when
+            indexed, or None.
         rigid_bodies: Rigid bodies, or None.
         body_poses: Poses of rigid bodies, see `State.body_poses`, shape (F, N, 3, 4) or (F, B, N, 3, 4), read when indexed, or None.
         contacts: `Contacts` of each frame, read when indexed by a number, or None if not recorded.
@@ -280,6 +298,8 @@ class TrajectoryReader:
             self.obstacles = _described_by(Obstacles, model["obstacles"])
         if "rigid_bodies" in model:
             self.rigid_bodies = _described_by(Bodies, model["rigid_bodies"])
+            if self.rigid_bodies.shapes.any():
+                self.obstacle_points = NodeFrames(self)
         self.contact_scales = self.contacts = None
         if "touching" in model:
             names, size, force = (_array(model["touching"][name]) for name in ("names", "size", "force"))

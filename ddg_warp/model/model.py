@@ -160,10 +160,7 @@ class Model:
     @property
     def rigid_bodies(self) -> Bodies | None:
         """Rigid bodies, for recordings; None without."""
-        if not self.scene.bodies:
-            return None
-        host = self.coupled.host
-        return Bodies.of(self.scene.bodies, host.rest[host.rigid_bodies.centers])
+        return self.order.rigid_bodies
 
     @property
     def contact_scales(self) -> ContactScales | None:

@@ -103,15 +103,6 @@ def body_state(state, index: int) -> BodyState:
     return BodyState(*(value[0, 0] if state.model.worlds == 1 else value[:, 0] for value in values))
 
 
-def shape_points(state) -> np.ndarray:
-    """Return the nodes of all shapes of rigid bodies in a `State` (worlds, M, 3) [m], in the order of bodies."""
-    host, poses = state.model.coupled.host, body_states(state)
-    shapes = [(index, shape.points) for index, body in enumerate(state.model.scene.bodies) for shape in body.shapes]
-    owner = np.repeat([index for index, _ in shapes], [len(points) for _, points in shapes])
-    arms = np.concatenate([points for _, points in shapes]) - host.rest[host.rigid_bodies.centers[owner]]
-    return poses.position[:, owner] + np.einsum("wnij,nj->wni", poses.rotation[:, owner], arms)
-
-
 def body_energies(state) -> tuple[np.ndarray, np.ndarray]:
     """Return the rotational kinetic energy of rigid bodies, and the potential of gravity that masses of dofs lack (worlds,) [J].
 

@@ -12,7 +12,7 @@ from ddg_warp import device_arrays as arrays
 from ddg_warp.capture_lock import launches
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import polyline
-from ddg_warp.model.rigid_bodies import BodyState, body_state, body_states, shape_points
+from ddg_warp.model.rigid_bodies import BodyState, body_state, body_states
 from ddg_warp.scene.descriptions import Dynamics
 from ddg_warp.scene.handle import BODY, OBSTACLE, Handle, named
 from ddg_warp.typing import Array, Bools, Device, Floats, Names
@@ -245,8 +245,9 @@ class State:
                 or [np.zeros(0, int)]
             )
             values.append(self.coupled.q.numpy().astype(float).reshape(model.worlds, -1, 3)[:, nodes])
-        if any(body.shapes for body in model.scene.bodies):
-            values.append(shape_points(self))
+        if model.bodies:
+            poses = self.body_poses().reshape(model.worlds, -1, 3, 4)
+            values.append(model.rigid_bodies.nodes(model.obstacles, poses))
         result = np.concatenate(values, axis=1)
         return result[0] if model.worlds == 1 else result
 

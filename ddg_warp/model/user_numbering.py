@@ -9,6 +9,7 @@ import warp as wp
 from ddg_warp import argument_checks
 from ddg_warp.compile import axisymmetric
 from ddg_warp.errors import SceneError
+from ddg_warp.io.bodies import Bodies
 from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.io.shapes import Curves, Surfaces
 from ddg_warp.model.rod_group import RodGroup
@@ -68,6 +69,15 @@ class UserNumbering:
             return None
         points = [batch.points.reshape(-1, 3) for batch in scene.batches] + [shell.points for shell in scene.shells]
         return Obstacles.of(shapes, np.concatenate([np.zeros((0, 3)), *points]))
+
+    @cached_property
+    def rigid_bodies(self) -> Bodies | None:
+        """Rigid bodies, for recordings; None without."""
+        bodies = self.model.scene.bodies
+        if not bodies:
+            return None
+        host = self.model.coupled.host
+        return Bodies.of(bodies, host.rest[host.rigid_bodies.centers])
 
     @cached_property
     def coupled_rows(self) -> tuple[np.ndarray, np.ndarray]:

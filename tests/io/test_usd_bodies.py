@@ -244,15 +244,17 @@ def test_other_bodies_are_refused(device, tmp_path):
         ddg.Recorder(model, tmp_path, resume=True)
 
 
-def test_trajectories_without_descriptions_are_exported(device, tmp_path):
-    """Shapes of bodies without a description become moving obstacles."""
-    run(device, tmp_path, 2)
-    with h5py.File(tmp_path / "trajectory.h5", "r+") as file:
-        del file["model/rigid_bodies"], file["model"].attrs["crc32"]
-    export_usd(tmp_path / "trajectory.h5", tmp_path / "export.usdc")
-    assert validate(tmp_path / "export.usdc") == []
-    stage = Usd.Stage.Open(str(tmp_path / "export.usdc"))
-    assert UsdGeom.Mesh(stage.GetPrimAtPath("/World/head")).GetPointsAttr().GetNumTimeSamples() == 3
+@pytest.mark.parametrize("worlds", [1, 2])
+def test_trajectories_hold_poses_alone(device, tmp_path, worlds):
+    """Nodes of shapes are not stored but placed by the recorded poses."""
+    _, states = run(device, tmp_path, 3, worlds)
+    with TrajectoryReader(tmp_path / "trajectory.h5") as reader:
+        nodes = reader.obstacle_points
+        assert nodes.shape == nodes[:].shape == np.shape([state.obstacle_points() for state in states])
+        np.testing.assert_allclose(nodes[:], [state.obstacle_points() for state in states], rtol=0.0, atol=1e-15)
+        np.testing.assert_array_equal(nodes[-1], nodes[1:][-1])
+    with h5py.File(tmp_path / "trajectory.h5") as file:
+        assert file["trajectory/obstacle_points"].shape[-2] == 1  # of the guide
 
 
 def test_bodies_without_shapes_and_rods_are_recorded(device, tmp_path):
