@@ -33,7 +33,7 @@ class Bodies:
 
     @classmethod
     def of(cls, bodies, origin: np.ndarray) -> Bodies:
-        """Describe rigid bodies of a scene by their data and the rest positions of their poses."""
+        """Describe rigid bodies of a scene, with the rest positions of poses (N, 3) [m]."""
         return cls(
             names=np.array([body.name for body in bodies], object),
             mass=np.array([body.mass for body in bodies], float),
