@@ -26,7 +26,12 @@ LAYERS = (
     "rl",
 )
 # Methods of lower-layer objects that import their implementation when called.
-FACADES = {"scene/scene.py": "model", "model/model.py": "postprocess", "run/cli.py": "data"}
+FACADES = {
+    "scene/scene.py": "model",
+    "model/model.py": "postprocess",
+    "solve/stepping/integrator.py": "postprocess",
+    "run/cli.py": "data",
+}
 
 
 def layer(module: str) -> int:

@@ -202,9 +202,13 @@ class NodeFrames:
     def __len__(self) -> int:
         return len(self._poses)
 
-    def __getitem__(self, frames) -> np.ndarray:
+    def __getitem__(self, index) -> np.ndarray:
+        frames, *others = index if isinstance(index, tuple) else (index,)
         nodes = self._bodies.nodes(self._obstacles, self._poses[frames])
-        return nodes if self._of_obstacles is None else np.concatenate([self._of_obstacles[frames], nodes], axis=-2)
+        if self._of_obstacles is not None:
+            nodes = np.concatenate([self._of_obstacles[frames], nodes], axis=-2)
+        axes = (slice(None),) * (not isinstance(frames, int | np.integer))
+        return nodes[(*axes, *others)]
 
 
 class ContactFrames:

@@ -177,7 +177,7 @@ class Sample:
         return slice(None)
 
     def at_rest(self) -> dict[str, np.ndarray]:
-        """Return data without forces: rest strains and strains of the last step equal the strains."""
+        """Return data without forces: rest strains and strains of the last step equal the strains, and no torque or stop acts."""
         data = {} if self.term.rest else self.straight()
         strain = self.strains(**data)[0]
         buffer, last = self.data["buffer"].copy(), self.data["last"].copy()
@@ -185,17 +185,20 @@ class Sample:
             buffer[self.parameter_rows("rest")] = strain
         if self.term.density.lagged:
             last[self.rows] = strain
+        buffer[self.parameter_rows("torque", "stop")] = 0.0
         return {**data, "buffer": buffer, "last": last}
 
     def isotropic(self) -> "Sample":
         """Return an isotropic sample: for strains that form a vector, equal stiffness and no rest strain."""
-        if not self.measure.vector:
+        names = [name.split()[0] for name in self.measure.strains]
+        space = [k for k, name in enumerate(names) if name.endswith(("_x", "_y", "_z"))]
+        if not space:
             return self
         buffer = self.data["buffer"].copy()
-        buffer[self.parameter_rows("rest")] = 0.0
         for family in {parameter.family for parameter in self.term.parameters if parameter.number}:
             rows = self.parameter_rows(family)
-            buffer[rows] = buffer[rows[0]]
+            rows = rows if self.measure.vector else [rows[k] for k in space]
+            buffer[rows] = 0.0 if family == "rest" else buffer[rows[0]]
         return self.like({**self.data, "buffer": buffer})
 
     def turned(self, turn: np.ndarray) -> dict[str, np.ndarray]:

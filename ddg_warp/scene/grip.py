@@ -6,7 +6,7 @@ import numpy as np
 
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
-from ddg_warp.typing import Floats, Vector
+from ddg_warp.typing import Floats, Numbers, Vector
 
 
 @argument_checks.called
@@ -39,7 +39,7 @@ class Grip:
         """Return the row of `Motion.pose` (1, 21) of a grip at rest; the device adds the pose."""
         return np.concatenate([np.zeros(3), np.eye(3).ravel(), self.pivot, np.zeros(6)])[None]
 
-    def at(self, position, quaternion=(1.0, 0.0, 0.0, 0.0), near=None) -> np.ndarray:
+    def at(self, position: Numbers, quaternion: Numbers = (1.0, 0.0, 0.0, 0.0), near: Numbers | None = None) -> Floats:
         """Return the pose (..., 6) with the pivot at a position (..., 3) [m], rotated from rest by a quaternion (..., 4).
 
         Args:

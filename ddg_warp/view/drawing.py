@@ -103,7 +103,7 @@ class Drawing:
     def __init__(self, curves: Curves, surfaces: Surfaces | None, worlds: int, points: np.ndarray, obstacles=None):
         self.shapes, self.obstacles = Shapes.of(curves, surfaces, worlds), obstacles
         points = np.reshape(points, (-1, 3))
-        self.size = float(np.linalg.norm(np.ptp(points, axis=0))) or 1.0
+        self.size = (float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0) or 1.0
         self.chosen = np.zeros(0, int), 1
         notes: list[str] = []
         self.lines = self._rods(notes)

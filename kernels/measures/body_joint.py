@@ -107,10 +107,10 @@ def _advance(real):
 
 
 def _sample(random, count: int) -> dict:
-    """Return ghosts about a common axis, twisted by several revolutions."""
+    """Return ghosts about a common axis, twisted by about half a revolution."""
     along = np.repeat(np.eye(3)[:1], count, axis=0)
     ghosts = [lagged_frames(random, along) for _ in range(2)]
-    return {"lag": np.concatenate([*ghosts, 6.0 * random.normal(size=(1, count))])}
+    return {"lag": np.concatenate([*ghosts, 3.0 * random.normal(size=(1, count))])}
 
 
 separation = Measure("separation", 3, ((0, 1),), SEPARATION, _separation_functions)

@@ -19,6 +19,7 @@ DISTANCES = {
     "edges": ipctk.edge_edge_distance,
     "point and triangle": ipctk.point_triangle_distance,
     "edge and point": lambda a, b, p, _: ipctk.point_edge_distance(p, a, b),
+    "two points": lambda a, b, *_: ipctk.point_point_distance(a, b),
 }
 STENCILS = {"edge_edge": edge_edge, "point_triangle": point_triangle}
 

@@ -118,7 +118,7 @@ def extent(stage, path: str, code: float) -> np.ndarray:
 
 @pytest.mark.parametrize("worlds", [1, 2])
 def test_transforms_place_bodies_and_shapes(device, tmp_path, worlds):
-    """Transforms and shapes of a run and of its export equal the states; obstacles stay meshes."""
+    """Recorded and exported transforms and shapes equal the states; obstacles stay meshes."""
     model, states = run(device, tmp_path, 5, worlds)
     export_usd(tmp_path / "trajectory.h5", tmp_path / "export.usda")
     for name in ("scene.usdc", "export.usda"):

@@ -464,7 +464,7 @@ def test_stiffnesses_are_identified():
             None,
             r"rod_stretch.stiffness has shape \(4,\); give \(\), \(2, 1\)",
         ),
-        (None, {"force": torch.zeros(3)}, "there is no 'force'; there are forces"),
+        (None, {"force": torch.zeros(3)}, "there is no 'force'; there are angles, torques, wrenches, forces"),
         (None, {"gravity": torch.zeros(4)}, r"gravity have shape \(4,\); they are \(3,\) or \(2, 3\)"),
         (None, {"poses": torch.zeros((0, 6))}, "poses of no grip"),
         ([1.0], None, r"parameters are \[1.0\]; give a dictionary"),
