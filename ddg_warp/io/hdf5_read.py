@@ -203,12 +203,12 @@ class NodeFrames:
         return len(self._poses)
 
     def __getitem__(self, index) -> np.ndarray:
-        frames, *others = index if isinstance(index, tuple) else (index,)
+        frames, *inner = index if isinstance(index, tuple) else (index,)
         nodes = self._bodies.nodes(self._obstacles, self._poses[frames])
         if self._of_obstacles is not None:
             nodes = np.concatenate([self._of_obstacles[frames], nodes], axis=-2)
         axes = (slice(None),) * (not isinstance(frames, int | np.integer))
-        return nodes[(*axes, *others)]
+        return nodes[(*axes, *inner)]
 
 
 class ContactFrames:
