@@ -32,7 +32,10 @@ def fields(model) -> list[Field]:
 
 
 def view(array: wp.array) -> torch.Tensor:
-    """Return a tensor view of an array."""
+    """Return a tensor view of an array, whatever torch's default device."""
+    if array.device.is_cpu and torch.get_default_device().type != "cpu":
+        with torch.device("cpu"):  # `wp.to_torch` would copy memory of the host to the default device
+            return wp.to_torch(array, requires_grad=False)
     return wp.to_torch(array, requires_grad=False)
 
 

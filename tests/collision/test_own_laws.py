@@ -121,9 +121,12 @@ def test_a_law_without_end_may_overlap(device):
 
 @pytest.mark.parametrize(("law", "density"), [("barrier", log_barrier), ("penalty", smooth_penalty)])
 def test_laws_of_the_package_given_by_hand_are_the_same(device, law, density):
-    """Laws by name and by hand give bitwise equal steps with friction, of rods on each other and on the floor."""
+    """Laws by name and by hand give equal steps with friction, of rods on each other and on the floor; bitwise on the CPU.
+
+    On CUDA multiplications and additions are fused differently in the module of a user's law.
+    """
     usual, by_hand = (moved(rods(each), device) for each in (law, ddg.Law(density)))
-    np.testing.assert_array_equal(by_hand, usual)
+    np.testing.assert_allclose(by_hand, usual, rtol=0.0, atol=0.0 if device == "cpu" else 1e-12)
     start = rods(law).build(device, "float64").state().points()
     assert (start - usual)[:, 2].max() > 1e-3
 

@@ -215,7 +215,7 @@ with ddg.Recorder(model, sys.argv[2], block=2) as recorder:
 def test_killed_run_resumes(device, tmp_path):
     """A killed recording continues bitwise like an uninterrupted one."""
     path, folders = tmp_path / "killed" / "trajectory.h5", [Path(__file__).resolve().parents[2], Path(__file__).parent]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, folders))}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, [*folders, *sys.path]))}
     command = [sys.executable, "-c", CHILD, str(device), str(path.parent)]
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as child:
         lines = [child.stdout.readline() for _ in range(7)]

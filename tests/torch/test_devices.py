@@ -9,12 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 
 import ddg_warp as ddg
 from ddg_warp.errors import SceneError
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import Simulator  # noqa: E402
+from ddg_warp.torch.state_layout import view  # noqa: E402
 
 
 @pytest.fixture
@@ -95,3 +97,12 @@ def test_two_processes_train_as_one(tmp_path):
         assert done.returncode == 0, done.stderr[-2000:]
         sums.append(float(re.search(r"sum of weights (\S+)", done.stdout)[1]))
     assert sums[0] == pytest.approx(sums[1], rel=1e-12)
+
+
+@pytest.mark.parametrize("default", ["cpu", "meta"])
+def test_views_share_memory_whatever_the_default_device(default):
+    """Models of the CPU serve where torch makes tensors elsewhere; "meta" stands for CUDA."""
+    array = wp.zeros(3, dtype=wp.vec3d, device="cpu")
+    with torch.device(default):
+        view(array).fill_(2.0)
+    np.testing.assert_array_equal(array.numpy(), 2.0)

@@ -5,6 +5,7 @@ import pytest
 
 import ddg_warp as ddg
 from ddg_warp.errors import SceneError
+from tests.adjoint import differences
 
 torch = pytest.importorskip("torch")
 from ddg_warp.torch import Simulator  # noqa: E402
@@ -26,7 +27,7 @@ def simulator(kind: str, scheme: str = "implicit_euler", values=0.0) -> Simulato
         scene.add_obstacle(ddg.Plane())
         scene.contact()
     scene.prescribe("muscle", "rod_bend_twist.rest_1", values, rods=rods)
-    return Simulator(scene.build("cpu", "float64"), DT, scheme=scheme, rtol=1e-11)
+    return Simulator(scene.build(differences.DEVICE, "float64"), DT, scheme=scheme, rtol=1e-11)
 
 
 def random(*shape, seed: int = 0) -> torch.Tensor:
