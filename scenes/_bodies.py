@@ -74,6 +74,14 @@ def frequency(times, values) -> float:
     return 2.0 * np.pi / np.diff(rises).mean() if len(rises) > 1 else np.nan
 
 
+def joined(*meshes: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return one mesh of several, each of points (n, 3) and triangles (t, 3)."""
+    first = np.cumsum([0] + [len(points) for points, _ in meshes])
+    return np.concatenate([points for points, _ in meshes]), np.concatenate(
+        [triangles + offset for (_, triangles), offset in zip(meshes, first[:-1], strict=True)]
+    )
+
+
 def drawn(points: np.ndarray, cells: np.ndarray, *lines: np.ndarray, width: float) -> tuple:
     """Return a surface, grey, and lines (n, 3) as red tubes of a radius `width` [m], for pictures."""
     parts, colors = [(points, cells)], [np.full((len(cells), 3), GREY)]
@@ -85,4 +93,4 @@ def drawn(points: np.ndarray, cells: np.ndarray, *lines: np.ndarray, width: floa
             quads = corners[: sizes[sizes == 4].sum()].reshape(-1, 4)
             parts.append((tube, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])))
             colors.append(np.tile(RED, (len(parts[-1][1]), 1)))
-    return *_many_rods.joined(*parts), np.concatenate(colors)
+    return *joined(*parts), np.concatenate(colors)

@@ -151,7 +151,7 @@ def picture(result, frames) -> dict:
     for time in (times[0], times[3], times[5]):
         parts = [*_car(result, time), *(ground if time == times[0] else [])]
         colors = [np.full((len(cells), 3), GREY if k > 4 else BLUE) for k, (_, cells) in enumerate(parts)]
-        bodies[time] = *_many_rods.joined(*parts), np.concatenate(colors)
+        bodies[time] = *_bodies.joined(*parts), np.concatenate(colors)
     return {"points_by_time": {t: frames[t] for t in bodies}, "bodies": bodies}
 
 
