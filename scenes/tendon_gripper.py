@@ -120,7 +120,7 @@ def check(result) -> list[ddg.Check]:
     """Check the moments on the fingers, and that these hold the cylinder."""
     scene = result.scene
     checks = _many_rods.checks(result)
-    return checks + once_reached(result, scene.analysis.duration, NAMES, lambda: _checks(result))
+    return checks + once_reached(result, max(LOWERED, scene.analysis.duration), NAMES, lambda: _checks(result))
 
 
 def _checks(result) -> list[ddg.Check]:
