@@ -18,7 +18,7 @@ import warp as wp
 
 from ddg_warp.kernels.elements import parallel_transport
 from ddg_warp.kernels.measures import Measure, lagged_frames
-from ddg_warp.kernels.measures.joint_curvature_twist import rotations
+from ddg_warp.kernels.measures.joint_curvature_twist import ghost_function, rotations
 from ddg_warp.kernels.measures.rod_curvature_twist import rod_curvature_twist
 
 SEPARATION = ("separation_x [m]", "separation_y [m]", "separation_z [m]")
@@ -88,18 +88,14 @@ def _advance(real):
     Q, S, _, _ = hinge.types(real)
     V, L = wp.types.vector(3, real), wp.types.vector(13, real)
     _, reference_twist, _ = parallel_transport.functions(real)
-    turned, *_ = rotations(real)
+    ghost = ghost_function(real)
 
     @wp.func
     def advance(q: Q, s: S):
         """Return the ghosts, rotated by their bodies, and the angle between them."""
         first, second = V(q[3], q[4], q[5]), V(q[6], q[7], q[8])
-        t1 = wp.normalize(turned(first, V(s[3], s[4], s[5])))
-        u1 = turned(first, V(s[0], s[1], s[2]))
-        u1 = wp.normalize(u1 - t1 * wp.dot(u1, t1))
-        t2 = wp.normalize(turned(second, V(s[9], s[10], s[11])))
-        u2 = turned(second, V(s[6], s[7], s[8]))
-        u2 = wp.normalize(u2 - t2 * wp.dot(u2, t2))
+        u1, t1 = ghost(first, V(s[0], s[1], s[2]), V(s[3], s[4], s[5]))
+        u2, t2 = ghost(second, V(s[6], s[7], s[8]), V(s[9], s[10], s[11]))
         m = reference_twist(u1, u2, t1, t2, s[12])
         return L(u1[0], u1[1], u1[2], t1[0], t1[1], t1[2], u2[0], u2[1], u2[2], t2[0], t2[1], t2[2], m)
 

@@ -200,19 +200,32 @@ def functions(real, between: bool = False):
 
 
 @cache
+def ghost_function(real):
+    """Return the device function `ghost(w, u, t)`: director and tangent of a ghost after a rotation vector, orthonormal."""
+    V = wp.types.vector(3, real)
+    turned, *_ = rotations(real)
+
+    @wp.func
+    def ghost(omega: V, director: V, tangent: V):
+        t = wp.normalize(turned(omega, tangent))
+        u = turned(omega, director)
+        return wp.normalize(u - t * wp.dot(u, t)), t
+
+    return ghost
+
+
+@cache
 def _advance(real):
     Q, S, _, _ = joint_curvature_twist.types(real)
     V, L = wp.types.vector(3, real), wp.types.vector(7, real)
     _, reference_twist, _ = parallel_transport.functions(real)
-    turned, *_ = rotations(real)
+    ghost = ghost_function(real)
 
     @wp.func
     def advance(q: Q, s: S):
         """Return the ghost frame, rotated by the joint, and the angle from it to the frame of the edge."""
         omega = V(q[4], q[5], q[6])
-        t = wp.normalize(turned(omega, V(s[9], s[10], s[11])))
-        u = turned(omega, V(s[6], s[7], s[8]))
-        u = wp.normalize(u - t * wp.dot(u, t))
+        u, t = ghost(omega, V(s[6], s[7], s[8]), V(s[9], s[10], s[11]))
         m = reference_twist(u, V(s[0], s[1], s[2]), t, V(s[3], s[4], s[5]) * s[13], s[12])
         return L(u[0], u[1], u[2], t[0], t[1], t[2], m)
 

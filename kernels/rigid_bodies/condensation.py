@@ -154,7 +154,7 @@ def condense_kernel(real, linear, quadratic: bool, alone: bool):
     the identity (`PLAIN`) or D of a carried node. `alone`: no element set has begun the matrix.
     """
     M, Bodies, Mass = wp.types.matrix((3, 3), linear), bodies_type(real), mass_type(real, quadratic)
-    inertia_of = inertia_function(real, linear, quadratic)
+    inertia_of, (_, block) = inertia_function(real, linear, quadratic), coupling_functions(linear)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def condense(
@@ -182,15 +182,9 @@ def condense_kernel(real, linear, quadratic: bool, alone: bool):
             if rows[t] >= 0:
                 m = inertia_of(mass, scalars[INERTIA_COEFFICIENT, w], w, rows[t])
         else:
-            for i in range(3):
-                for j in range(3):
-                    m[i, j] = matrix[3 * i + j, target]
+            m = block(matrix, target)
         for entry in range(starts[t], starts[t + 1]):
-            source = sources[entry] + w * positions
-            k = M()
-            for i in range(3):
-                for j in range(3):
-                    k[i, j] = matrix[3 * i + j, source]
+            k = block(matrix, sources[entry] + w * positions)
             if left[entry] != wp.static(PLAIN):
                 k = wp.transpose(M(bodies.derivative[left[entry] + carried])) * k
             if right[entry] != wp.static(PLAIN):
