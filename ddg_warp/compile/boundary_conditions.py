@@ -5,6 +5,7 @@ import numpy as np
 from ddg_warp.compile.dof_map import FREE, DofStorage, Held
 from ddg_warp.compile.loads import Couple
 from ddg_warp.errors import SceneError
+from ddg_warp.scene.descriptions import supports_of
 from ddg_warp.scene.grip import Grip
 
 STILL = FREE - 1  # pose index of a dof fixed at rest
@@ -14,7 +15,7 @@ _NONE = np.zeros(0, int)
 
 def scene_motions(scene) -> list:
     """Return the distinct prescribed motions of a scene, in order of appearance."""
-    supports = [*scene.supports, *scene.shell_supports, *scene.ring_supports, *scene.obstacles]
+    supports = supports_of(scene)
     return list({id(s.motion): s.motion for s in supports if s.motion is not None}.values())
 
 

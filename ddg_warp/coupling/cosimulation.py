@@ -12,6 +12,7 @@ from ddg_warp.errors import SceneError
 from ddg_warp.model.controls import Controls, checked
 from ddg_warp.model.model import check_model
 from ddg_warp.model.state import State, check_state
+from ddg_warp.scene.descriptions import supports_of
 from ddg_warp.scene.grip import Grip
 from ddg_warp.solve.stepping.integrator import Integrator
 from ddg_warp.solve.stepping.wrenches import Reactions
@@ -83,11 +84,11 @@ class MuJoCo:
         self._start = start_data(call, self.mj_model, data), model.state() if state is None else state
         check_state(call, model, self._start[1])
         self._bodies = _attached(call, model, self.mj_model, attach)
-        scene = model.scene
-        supports = [*scene.supports, *scene.shell_supports, *scene.ring_supports, *scene.obstacles]
         grips = {id(model.grips[index]): body for index, body in self._bodies.items()}
         self._rows = sorted(set(self._bodies.values()))
-        self._owners = [(i, grips[id(s.motion)]) for i, s in enumerate(supports) if id(s.motion) in grips]
+        self._owners = [
+            (i, grips[id(s.motion)]) for i, s in enumerate(supports_of(model.scene)) if id(s.motion) in grips
+        ]
         self._first = self._start[1].poses()  # of grips at the start
         self.integrator = Integrator(model, **options)
         self.integrator.watch_wrenches()
@@ -232,7 +233,7 @@ def _attached(call: str, model, mj_model, attach) -> dict[int, int]:
 
 def _grip_named(call: str, scene, name) -> Grip:
     """Return the grip of the supports or obstacles of a name."""
-    supports = [*scene.supports, *scene.shell_supports, *scene.ring_supports, *scene.obstacles]
+    supports = supports_of(scene)
     if type(name) is not str:
         raise SceneError(
             f"{call}: attach: {argument_checks.shown(name)}; give a Grip, or the name of a support or obstacle"

@@ -257,3 +257,8 @@ class Attachment:
     shell: int
     vertices: np.ndarray
     glued: bool
+
+
+def supports_of(scene) -> list:
+    """Return all supports of a scene, of rods, shells and rings, then obstacles, as ordered in `Reactions`."""
+    return [*scene.supports, *scene.shell_supports, *scene.ring_supports, *scene.obstacles]

@@ -10,7 +10,7 @@ from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.geometry import polyline
 from ddg_warp.scene import edge_forces
 from ddg_warp.scene.contact import check_contact
-from ddg_warp.scene.descriptions import Dynamics, PathAnalysis, Statics
+from ddg_warp.scene.descriptions import Dynamics, PathAnalysis, Statics, supports_of
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.prescribed_motion import Motion
 
@@ -58,8 +58,7 @@ def check_scene(scene) -> None:
         laws.check(scene)
     _check_magnets(scene)
     check_contact(scene)
-    every = (*scene.supports, *scene.shell_supports, *scene.ring_supports, *scene.obstacles)
-    supports = [s for s in every if isinstance(s.motion, Motion)]  # a grip starts at rest
+    supports = [s for s in supports_of(scene) if isinstance(s.motion, Motion)]  # a grip starts at rest
     if not supports or scene.initial is not None or not isinstance(scene.analysis, Dynamics):
         return  # an initial state may be displaced, and equilibria have no initial time
     objects = [*scene.batches, *scene.shells, *scene.axisymmetric_shells]

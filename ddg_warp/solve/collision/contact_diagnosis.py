@@ -7,6 +7,7 @@ import warp as wp
 
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.core import outcome
+from ddg_warp.scene.descriptions import supports_of
 from ddg_warp.scene.obstacles import Obstacle
 
 STIFFER = 100.0  # suggested stiffness factor where the minimum gap was reached: enough in five of five cases of cloth, 10 in four
@@ -76,7 +77,7 @@ class ContactDiagnosis:
         host, scene = self.coupled.host, self._scene
         if gap > max(self.least, 0.0) or not all(host.fixed[pair_nodes].all() for pair_nodes in nodes):
             return ""
-        supports = [*scene.supports, *scene.shell_supports, *scene.ring_supports, *scene.obstacles]
+        supports = supports_of(scene)
         moved = {
             f"obstacle '{support.name}'" if isinstance(support, Obstacle) else f"support {number} ({support.call})"
             for number, (support, support_dofs) in enumerate(zip(supports, host.held, strict=True))
