@@ -9,6 +9,7 @@ from ddg_warp import argument_checks
 from ddg_warp.coupling.mujoco_model import WORLD, compiled, mujoco_module, name_of, start_data
 from ddg_warp.coupling.mujoco_shapes import collides, shape_of, unsupported
 from ddg_warp.errors import SceneError
+from ddg_warp.geometry.mass_properties import point_inertia
 from ddg_warp.scene.handle import Handle
 
 
@@ -83,9 +84,7 @@ def _add_body(scene, mj_model, data, root: int) -> Handle:
     center, inertia = masses @ centers / mass, np.zeros((3, 3))
     for body, part_mass, arm in zip(bodies, masses, centers - center, strict=True):
         axes = data.ximat[body].reshape(3, 3)
-        inertia += axes * mj_model.body_inertia[body] @ axes.T + part_mass * (
-            arm @ arm * np.eye(3) - np.outer(arm, arm)
-        )
+        inertia += axes * mj_model.body_inertia[body] @ axes.T + point_inertia(part_mass, arm)
     rates = np.zeros(6)
     mujoco.mj_objectVelocity(mj_model, data, mujoco.mjtObj.mjOBJ_BODY, root, rates, 0)
     spin = rates[:3]

@@ -24,6 +24,17 @@ def mass_properties(shapes, density: float) -> tuple[float, np.ndarray, np.ndarr
     return density * volume, center, density * (np.trace(second) * np.eye(3) - second)
 
 
+def point_inertia(mass: float, arm: np.ndarray) -> np.ndarray:
+    """Return the inertia tensor of a point mass [kg] at `arm` (3,) [m] from the origin (3, 3) [kg m^2]."""
+    return mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+
+
+def principal_axes(tensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return principal moments (3,) and axes, columns of a rotation (3, 3), of an inertia tensor."""
+    moments, axes = np.linalg.eigh(tensor)
+    return moments, axes * np.sign(np.linalg.det(axes))
+
+
 def _moments(shape) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the integrals of 1, x and x x^T over a shape."""
     if shape.kind == "ball":

@@ -88,13 +88,18 @@ class BodyState:
 def body_states(state, chosen=slice(None)) -> BodyState:
     """Return poses and rates of rigid bodies in a `State`, arrays (worlds, bodies, ...), of all or chosen ones."""
     model, host = state.model, state.model.coupled.host.rigid_bodies
-    of_worlds = (array.numpy().astype(float) for array in (state.coupled.rotation, state.coupled.momentum))
-    rotation, momentum = (v.reshape(model.worlds, len(host), *v.shape[1:])[:, chosen] for v in of_worlds)
+    rotation, momentum = (values[:, chosen] for values in _rotations_and_momenta(state))
     blocks = (array.numpy().astype(float).reshape(model.worlds, -1, 3) for array in (state.coupled.q, state.coupled.v))
     position, velocity = (values[:, host.centers[chosen]] for values in blocks)
     rates = np.einsum("wbji,wbj->wbi", rotation, momentum) / host.moments[chosen]
     to_rest = host.axes[chosen].transpose(0, 2, 1)
     return BodyState(position, rotation @ to_rest, velocity, np.einsum("wbij,wbj->wbi", rotation, rates))
+
+
+def _rotations_and_momenta(state) -> tuple[np.ndarray, np.ndarray]:
+    """Return orientations (worlds, bodies, 3, 3) and angular momenta (worlds, bodies, 3) [kg m^2/s] of a `State`."""
+    arrays = (array.numpy().astype(float) for array in (state.coupled.rotation, state.coupled.momentum))
+    return tuple(values.reshape(state.model.worlds, -1, *values.shape[1:]) for values in arrays)
 
 
 def body_state(state, index: int) -> BodyState:
@@ -109,8 +114,7 @@ def body_energies(state) -> tuple[np.ndarray, np.ndarray]:
     The weight of a pinned body acts at its centre, while its mass counts at the pin.
     """
     model, host = state.model, state.model.coupled.host.rigid_bodies
-    of_worlds = (array.numpy().astype(float) for array in (state.coupled.rotation, state.coupled.momentum))
-    rotation, momentum = (v.reshape(model.worlds, len(host), *v.shape[1:]) for v in of_worlds)
+    rotation, momentum = _rotations_and_momenta(state)
     kinetic = 0.5 * (np.einsum("wbji,wbj->wbi", rotation, momentum) ** 2 / host.moments).sum((1, 2))
     q = state.coupled.q.numpy().astype(float).reshape(model.worlds, -1, 3)
     weight = model.coupled.host.mass[host.origins] * np.array(model.scene.gravity, float)

@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING, overload
 import numpy as np
 
 from ddg_warp.errors import SceneError
+from ddg_warp.kernels.terms import BODY_JOINTS
 from ddg_warp.scene.handle import BODY_JOINT, named
 from ddg_warp.solve.equilibrium.tangent import Tangent
+from ddg_warp.solve.equilibrium.tangent_part import TangentBlock
 from ddg_warp.solve.stepping.wrenches import Reaction
 from ddg_warp.typing import Floats
 
@@ -48,7 +50,7 @@ def of_equilibrium(model: "Model", state: "State", factor: float) -> JointWrench
     blocks = resultant.reshape(model.worlds, -1, 3)
     rigid = model.coupled.host.rigid_bodies
     weight = factor * pinned_masses(model) * np.array(model.scene.gravity)
-    return joint_wrenches(model, state, blocks[:, rigid.origins] - weight, blocks[:, rigid.spins])
+    return joint_wrenches(model, state, blocks[:, rigid.origins] - weight, blocks[:, rigid.spins], tangent)
 
 
 def pinned_masses(model: "Model") -> Floats:
@@ -57,18 +59,22 @@ def pinned_masses(model: "Model") -> Floats:
     return np.where(host.rigid_bodies.pinned, host.mass[host.rigid_bodies.origins, 0], 0.0)[:, None]
 
 
-def joint_wrenches(model: "Model", state: "State", force: Floats, moment: Floats) -> JointWrenches:
+def joint_wrenches(
+    model: "Model", state: "State", force: Floats, moment: Floats, tangent: TangentBlock | None = None
+) -> JointWrenches:
     """Return the force on the second body of every joint, and the moment about the point of the joint.
 
     Args:
         force, moment: sum of all forces on every body except its pin's, inertia included (worlds, bodies, 3). The pin of a body
             that is joined to the world balances it.
+        tangent: of the coupled system, if there is one already.
     """
-    host, scene, worlds = model.coupled.host, model.scene, model.worlds
-    rigid, tangent, count = host.rigid_bodies, Tangent(model).parts[-1], len(scene.body_joints)
+    scene, worlds = model.scene, model.worlds
+    rigid, count = model.coupled.host.rigid_bodies, len(scene.body_joints)
+    tangent = tangent or Tangent(model).parts[-1]
     forces, moments = np.zeros((worlds, count, 3)), np.zeros((worlds, count, 3))
     for index, part in enumerate(model.coupled.sets):
-        if part.term.name in ("ball_joint", "hinge"):
+        if part.term.name in BODY_JOINTS:
             joints = part.host.owner[0]
             gradient = tangent.forces(state, index).reshape(-1, worlds, part.elements, 3)
             forces[:, joints] = -gradient[SECOND_POINT]

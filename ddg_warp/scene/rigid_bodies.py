@@ -7,7 +7,7 @@ import numpy as np
 
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
-from ddg_warp.geometry.mass_properties import mass_properties
+from ddg_warp.geometry.mass_properties import mass_properties, principal_axes
 from ddg_warp.scene.handle import BODY, BODY_JOINT, SHELL, Handle, need
 from ddg_warp.scene.obstacles import Capsule, Mesh, Sphere
 from ddg_warp.typing import Numbers, Vector
@@ -304,8 +304,7 @@ def _principal(tensor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if np.array_equal(tensor, np.diag(np.diag(tensor))):
         moments, axes = np.diag(tensor).copy(), np.eye(3)
     else:
-        moments, axes = np.linalg.eigh(tensor)
-        axes *= np.sign(np.linalg.det(axes))
+        moments, axes = principal_axes(tensor)
     largest = moments.max()
     if not moments.min() > LEAST_MOMENT * largest or moments.sum() < 2.0 * largest * (1.0 - 1e-6):
         raise SceneError(

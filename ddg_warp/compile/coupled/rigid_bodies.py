@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ddg_warp.errors import SceneError
+from ddg_warp.geometry.mass_properties import point_inertia, principal_axes
 
 
 @dataclass
@@ -149,11 +150,9 @@ def take_masses(scene, coupled) -> None:
         origin = coupled.rest[bodies.origins[index]] if bodies.pinned[index] else center
         tensor = body.axes * body.moments @ body.axes.T
         for m, x in ((body.mass, body.center), *zip(mass, points, strict=True)):
-            d = x - origin
-            tensor = tensor + m * (d @ d * np.eye(3) - np.outer(d, d))
+            tensor = tensor + point_inertia(m, x - origin)
         if bodies.pinned[index] or mass.any():
-            bodies.moments[index], axes = np.linalg.eigh(tensor)
-            bodies.axes[index] = axes * np.sign(np.linalg.det(axes))
+            bodies.moments[index], bodies.axes[index] = principal_axes(tensor)
         bodies.velocity[index] += np.cross(body.angular_velocity, center - body.center)
         coupled.mass[nodes] = 0.0
         coupled.rest[bodies.centers[index]] = center
