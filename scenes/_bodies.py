@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ddg_warp.io.rod_tubes import tube_faces, tube_points
+from ddg_warp.io.rod_tubes import tube_points, tube_triangles
 from ddg_warp.scene.obstacles import Mesh
 from ddg_warp.scenes import _many_rods
 
@@ -44,7 +44,7 @@ def momentum(model, state) -> np.ndarray:
     mass = _many_rods.masses(model)[:, None]
     x, v = (array.numpy()[: len(mass)].astype(float) for array in (state.coupled.q, state.coupled.v))
     spin = state.coupled.momentum.numpy().astype(float).sum(0)
-    return np.concatenate([(mass * v).sum(0), np.cross(x, mass * v).sum(0) + spin])
+    return np.concatenate([_many_rods.momentum(model, state), np.cross(x, mass * v).sum(0) + spin])
 
 
 def energy(model, state) -> float:
@@ -88,9 +88,6 @@ def drawn(points: np.ndarray, cells: np.ndarray, *lines: np.ndarray, width: floa
     for line in lines:
         if len(line) > 1:
             counts = np.array([len(line)]), np.array([False])
-            tube = tube_points(line, *counts, np.full(len(line), width))
-            sizes, corners = tube_faces(*counts)
-            quads = corners[: sizes[sizes == 4].sum()].reshape(-1, 4)
-            parts.append((tube, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])))
+            parts.append((tube_points(line, *counts, np.full(len(line), width)), tube_triangles(*counts)))
             colors.append(np.tile(RED, (len(parts[-1][1]), 1)))
     return *joined(*parts), np.concatenate(colors)

@@ -30,6 +30,13 @@ def tube_faces(counts: np.ndarray, closed: np.ndarray) -> tuple[np.ndarray, np.n
     return sizes, np.concatenate([sides.ravel(), *(cap.ravel() for cap in caps)])
 
 
+def tube_triangles(counts: np.ndarray, closed: np.ndarray) -> np.ndarray:
+    """Return the triangles of tubes without end caps, shape (t, 3); see `tube_faces`."""
+    sizes, corners = tube_faces(counts, closed)
+    quads = corners[: sizes[sizes == 4].sum()].reshape(-1, 4)
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+
+
 def tube_points(points: np.ndarray, counts: np.ndarray, closed: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Return the vertices of the tubes [m], shape (SIDES P, 3): a ring around each point, parallel-transported.
 

@@ -10,7 +10,7 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 from ddg_warp.io.colors import SCALE
-from ddg_warp.io.rod_tubes import SIDES, tube_faces, tube_points
+from ddg_warp.io.rod_tubes import SIDES, tube_points, tube_triangles
 from ddg_warp.io.shapes import Shapes
 from ddg_warp.run.render import Canvas, View
 from ddg_warp.view.drawing import Drawing
@@ -222,10 +222,7 @@ def ruled(plot, view: View, unit: str, inch: float) -> None:
 def tubes(points: np.ndarray, curves) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (n, 3) and triangles (t, 3) of open tubes around rods with nodes (P, 3)."""
     counts, closed = np.asarray(curves.counts), np.asarray(curves.closed, bool)
-    sizes, corners = tube_faces(counts, closed)
-    quads = corners[: sizes[sizes == 4].sum()].reshape(-1, 4)
-    triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    return tube_points(points, counts, closed, np.asarray(curves.radius)), triangles
+    return tube_points(points, counts, closed, np.asarray(curves.radius)), tube_triangles(counts, closed)
 
 
 def per_node(color, curves) -> np.ndarray:

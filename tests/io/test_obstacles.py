@@ -1,10 +1,9 @@
 """Obstacles and contact in recordings: positions, and data read back, resumed and exported."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
+from recorded_run import record
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
@@ -43,18 +42,7 @@ def volume(points, cells) -> float:
 def run(device, folder, steps: int, worlds: int = 1, resume: bool = False, **options):
     """Record a run; return its model and states."""
     model = scene().build(device=device, worlds=worlds)
-    integrator, state = ddg.Integrator(model), model.state()
-    with ddg.Recorder(model, folder, block=2, resume=resume, **options) as recorder:
-        if resume:
-            with TrajectoryReader(Path(folder) / "trajectory.h5") as reader:
-                state = model.restore(reader.checkpoint())
-        recorder.record(state)
-        states = [state.copy()]
-        while round(state.time / DT) < steps:
-            state = integrator.step(state, DT)
-            recorder.record(state)
-            states.append(state.copy())
-    return model, states
+    return model, record(model, folder, steps, DT, resume, **options)
 
 
 def test_surfaces_enclose_the_volumes_of_obstacles(device):

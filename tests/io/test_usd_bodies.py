@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 import pytest
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
+from recorded_run import record
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
@@ -49,18 +50,7 @@ def scene(size: int = 1, heavy: bool = False) -> ddg.Scene:
 def run(device, folder, steps: int, worlds: int = 1, size: int = 1, resume: bool = False):
     """Record a run; return its model and states."""
     model = scene(size).build(device=device, worlds=worlds)
-    integrator, state = ddg.Integrator(model), model.state()
-    with ddg.Recorder(model, folder, block=2, resume=resume) as recorder:
-        if resume:
-            with TrajectoryReader(Path(folder) / "trajectory.h5") as reader:
-                state = model.restore(reader.checkpoint())
-        recorder.record(state)
-        states = [state.copy()]
-        while round(state.time / DT) < steps:
-            state = integrator.step(state, DT)
-            recorder.record(state)
-            states.append(state.copy())
-    return model, states
+    return model, record(model, folder, steps, DT, resume)
 
 
 def placed(stage, path: str, code: float) -> tuple[np.ndarray, np.ndarray]:
