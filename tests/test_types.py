@@ -11,7 +11,20 @@ from tests.test_docs import BLOCK, ROOT, TUTORIALS
 
 LINES = 100_000  # lines before the code of each page: more than any module has
 # Packages without annotations, and torch and matplotlib, which mypy would read for minutes: their types are `Any`.
-UNREAD = ("torch", "matplotlib", "pandas", "scipy", "warp", "h5py", "pxr", "tqdm", "viser", "gymnasium", "jax")
+UNREAD = (
+    "torch",
+    "matplotlib",
+    "pandas",
+    "scipy",
+    "warp",
+    "h5py",
+    "pxr",
+    "tqdm",
+    "viser",
+    "gymnasium",
+    "stable_baselines3",
+    "jax",
+)
 SPECIAL = ("__call__", "__enter__", "__exit__", "__getitem__", "__init__", "__iter__", "__len__", "__new__")
 
 
@@ -88,7 +101,7 @@ def check(pages: dict[str, str]) -> tuple[list[str], list[str]]:
 
 
 def _is_ours(expression, types: dict) -> bool:
-    """Return True for a name, attribute or item of this package."""
+    """Return True for a name, attribute or item of this package, except an attribute that a class inherits from an unread package."""
     from mypy import nodes
     from mypy.types import Instance, get_proper_type
 
@@ -99,7 +112,9 @@ def _is_ours(expression, types: dict) -> bool:
     if not isinstance(expression, nodes.MemberExpr | nodes.IndexExpr):
         return False
     owner = get_proper_type(types.get(expression.expr if isinstance(expression, nodes.MemberExpr) else expression.base))
-    return isinstance(owner, Instance) and owner.type.fullname.startswith("ddg_warp.")
+    if not isinstance(owner, Instance) or not owner.type.fullname.startswith("ddg_warp."):
+        return False
+    return isinstance(expression, nodes.IndexExpr) or owner.type.get(expression.name) is not None
 
 
 def _has_any(kind) -> bool:
