@@ -216,9 +216,11 @@ class CoupledTangent(TangentBlock):
         return self.into(state.coupled.v.numpy().astype(np.float64).ravel())
 
     def assign(self, state, q: np.ndarray) -> None:
+        q = self.back(q)
         if self.carried:
+            q = self.carried.place(state.coupled.q.numpy().astype(np.float64).ravel(), q)
             self.carried.turn(state.coupled, q)
-        state.coupled.q.assign(self.back(q).reshape(-1, 3))
+        state.coupled.q.assign(q.reshape(-1, 3))
 
     def retract(self, q: np.ndarray, step: np.ndarray) -> np.ndarray:
         """Return q moved along `step` by rotating edges of rods; see `ddg_warp.geometry.edge_rotation`.
