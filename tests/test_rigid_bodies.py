@@ -182,6 +182,37 @@ def test_damping_of_a_hinge():
     assert difference == pytest.approx(exact, rel=1e-9)
 
 
+def test_spring_of_a_hinge():
+    """Bodies swing by w^2 = k (1/I_a + 1/I_b) about the relaxed angle; a constant torque adds torque / k to the latter."""
+    spring, relaxed, torque = 0.02, 0.3, 0.004
+    rate = np.sqrt(spring * (1 / 5e-3 + 1 / 2e-3))
+    for drive, middle in (({"angle": relaxed}, relaxed), ({"torque": torque}, torque / spring)):
+        model, _, state = build(two_bodies(spring=spring, **drive))
+        integrator, count = ddg.Integrator(model, scheme="implicit_midpoint"), 400
+        for _ in range(count):
+            state = integrator.step(state, np.pi / rate / count)  # half a period
+        turned = [state.body(name).rotation for name in ("a", "b")]
+        angle = np.subtract(*(np.arctan2(r[1, 0], r[0, 0]) for r in reversed(turned)))
+        assert angle == pytest.approx(2.0 * middle, rel=1e-4)
+
+
+def test_servo_yields_to_a_weight():
+    """A servo of stiffness k at the angle phi_0 holds an arm at phi, k (phi - phi_0) = m g l cos(phi), in steps and in statics."""
+    mass, arm, stiffness, target = 0.5, 0.2, 4.0, 0.3
+    scene = ddg.Scene()
+    body = scene.add_body(mass=mass, inertia=(1e-3,) * 3, center=(arm, 0, 0))
+    scene.hinge(body, point=(0, 0, 0), axis=(0, 1, 0), angle=target, spring=stiffness, damping=0.5)
+    model, integrator, state = build(scene)
+    rest = ddg.statics.solve(model)
+    for _ in range(200):
+        state = integrator.step(state, 0.05, ddg.Controls(angles=[target]))
+    for balanced, wrench in ((rest, model.joint_wrenches(rest)), (state, integrator.joint_wrenches(state))):
+        turned = balanced.body(body).rotation
+        angle = np.arctan2(-turned[2, 0], turned[0, 0])
+        assert angle == pytest.approx(target + mass * GRAVITY * arm * np.cos(angle) / stiffness, abs=1e-6)
+        assert wrench[0].moment == pytest.approx([0, -mass * GRAVITY * arm * np.cos(angle), 0], rel=1e-5, abs=1e-9)
+
+
 def test_stops_of_a_hinge():
     """A torque rotates a body to the stop, and torque / stiffness beyond."""
     scene = ddg.Scene(gravity=(0, 0, 0), mass_damping=5.0)

@@ -29,21 +29,21 @@ class MuJoCoBodies:
 def add_bodies(scene, mj_model, *, data=None, ctrl: Mapping[str, float | Callable] | None = None) -> MuJoCoBodies:
     """Add the moving bodies of a MuJoCo model to a scene, with joints and motors; return their handles.
 
-    Masses, inertias and initial velocities are MuJoCo's. Bodies without a joint are merged with their parent. Hinges keep damping and
-    limits, the latter as stiff stops. Constraints `connect` and `weld` become balls and welds. Geoms that collide become shapes;
-    ellipsoids and cylinders become inscribed meshes, and meshes are not made convex. Geoms of the world are left out, see
-    `add_obstacles`; gravity is that of the scene.
+    Masses, inertias and initial velocities are MuJoCo's. Bodies without a joint are merged with their parent. Hinges keep springs,
+    damping and limits, the latter as stiff stops. Position and velocity servos become springs and damping of their hinges. Constraints
+    `connect` and `weld` become balls and welds. Geoms that collide become shapes; ellipsoids and cylinders become inscribed meshes, and
+    meshes are not made convex. Geoms of the world are left out, see `add_obstacles`; gravity is that of the scene.
 
     Args:
         scene: to which the bodies are added.
         mj_model: `MjModel`, or path or text of an MJCF or URDF file.
         data: `MjData` of the configuration at rest, with velocities; the initial one by default.
-        ctrl: control of motors by name, numbers or functions of time [s]; zero by default. The torque is the control, clipped to its
-            range, times gain and gear.
+        ctrl: control of motors and servos by name, numbers or functions of time [s]; zero by default. The torque is the control,
+            clipped to its range, times gain and gear, plus a bias that is linear in the position and rate of the hinge.
 
     Raises:
         SceneError: the model has features that rigid bodies lack; the message lists all of them. Examples are slides, several joints of
-            a body, springs, armature or friction of joints, actuators other than motors of hinges, and tendons.
+            a body, springs of balls, armature or friction of joints, actuators other than motors and servos of hinges, and tendons.
         MissingMuJoCoError: the package mujoco is missing.
     """
     call = "add_bodies"
@@ -110,15 +110,22 @@ def _add_joint(scene, mj_model, data, joint: int, parent: Handle | None, child: 
         return None
     if kind == mujoco.mjtJoint.mjJNT_BALL:
         return scene.ball(*pair, point=point, name=name)
-    stops = None
+    stops, start = None, data.qpos[mj_model.jnt_qposadr[joint]]
     if mj_model.jnt_limited[joint]:
-        stops = tuple(mj_model.jnt_range[joint] - data.qpos[mj_model.jnt_qposadr[joint]])
+        stops = tuple(mj_model.jnt_range[joint] - start)
+    actuators = np.flatnonzero(mj_model.actuator_trnid[:, 0] == joint)
+    _, by_angle, by_rate = _bias(mj_model, actuators)
+    stiffness = mj_model.jnt_stiffness[joint]
+    spring = float(stiffness - by_angle.sum())
+    relaxed = float(stiffness * mj_model.qpos_spring[mj_model.jnt_qposadr[joint]] / spring - start) if spring else None
     return scene.hinge(
         *pair,
         point=point,
         axis=data.xaxis[joint].copy(),
-        torque=_torque(mj_model, joint, ctrl),
-        damping=float(mj_model.dof_damping[mj_model.jnt_dofadr[joint]]),
+        angle=relaxed,
+        torque=_torque(mj_model, actuators, ctrl),
+        spring=spring or None,
+        damping=float(mj_model.dof_damping[mj_model.jnt_dofadr[joint]] - by_rate.sum()),
         stops=stops,
         name=name,
     )
@@ -126,30 +133,43 @@ def _add_joint(scene, mj_model, data, joint: int, parent: Handle | None, child: 
 
 @dataclass(frozen=True)
 class _Torque:
-    """Torque of the motors of a joint [N m], a function of time.
+    """Torque of motors and servos, except the part by angle and rate [N m], a function of time.
 
     Attributes:
-        motors: control (number or function of time), least and largest control, and factor, of each motor.
+        motors: control (number or function of time), least and largest control, and factor, of each actuator.
+        constant: [N m].
     """
 
     motors: tuple
+    constant: float
 
     def __call__(self, t: float) -> float:
         controls = ((ctrl(t) if callable(ctrl) else ctrl, *row) for ctrl, *row in self.motors)
-        return float(sum(factor * min(max(value, least), most) for value, least, most, factor in controls))
+        return self.constant + float(
+            sum(factor * min(max(value, least), most) for value, least, most, factor in controls)
+        )
 
 
-def _torque(mj_model, joint: int, ctrl: dict) -> _Torque | None:
-    """Return the torque of all motors of a joint; None without control."""
+def _torque(mj_model, actuators, ctrl: dict) -> _Torque | None:
+    """Return the torque of actuators of one joint; None without any."""
     motors = []
-    for actuator in np.flatnonzero(mj_model.actuator_trnid[:, 0] == joint):
-        value = ctrl.get(name_of(mj_model, "actuator", actuator))
-        if value is not None:
-            limited = mj_model.actuator_ctrllimited[actuator]
-            limits = mj_model.actuator_ctrlrange[actuator] if limited else (-np.inf, np.inf)
-            factor = mj_model.actuator_gear[actuator, 0] * mj_model.actuator_gainprm[actuator, 0]
-            motors.append((value, *map(float, limits), float(factor)))
-    return _Torque(tuple(motors)) if motors else None
+    for actuator in actuators:
+        value = ctrl.get(name_of(mj_model, "actuator", actuator), 0.0)
+        limited = mj_model.actuator_ctrllimited[actuator]
+        limits = mj_model.actuator_ctrlrange[actuator] if limited else (-np.inf, np.inf)
+        factor = mj_model.actuator_gear[actuator, 0] * mj_model.actuator_gainprm[actuator, 0]
+        motors.append((value, *map(float, limits), float(factor)))
+    return _Torque(tuple(motors), float(_bias(mj_model, actuators)[0].sum())) if motors else None
+
+
+def _bias(mj_model, actuators) -> np.ndarray:
+    """Return the constant torque of actuators, and its derivatives by the joint's angle and rate (3, actuators) [N m, s].
+
+    The force is bias_0 + bias_1 l + bias_2 dl/dt with l = gear angle, and the torque gear times that.
+    """
+    gear = mj_model.actuator_gear[actuators, 0]
+    affine = mj_model.actuator_biastype[actuators] == mujoco_module().mjtBias.mjBIAS_AFFINE
+    return np.where(affine, mj_model.actuator_biasprm[actuators, :3].T, 0.0) * [gear, gear**2, gear**2]
 
 
 def _add_equality(scene, mj_model, data, equality: int, handles: dict) -> Handle:
@@ -176,7 +196,9 @@ def _refused_joints(mj_model):
         dofs = slice(first, first + {kinds.mjJNT_FREE: 6, kinds.mjJNT_BALL: 3}.get(kind, 1))
         reasons = {
             "is a slide": kind == kinds.mjJNT_SLIDE,
-            "has a stiffness": mj_model.jnt_stiffness[joint].any(),
+            "has a stiffness and is no hinge": kind != kinds.mjJNT_HINGE and mj_model.jnt_stiffness[joint],
+            "has a nonlinear stiffness": np.any(getattr(mj_model, "jnt_stiffnesspoly", [[0]] * mj_model.njnt)[joint]),
+            "has nonlinear damping": np.any(getattr(mj_model, "dof_dampingpoly", [[0]] * mj_model.nv)[dofs]),
             "has armature": mj_model.dof_armature[dofs].any(),
             "has friction": mj_model.dof_frictionloss[dofs].any(),
             "has damping and is no hinge": kind != kinds.mjJNT_HINGE and mj_model.dof_damping[dofs].any(),
@@ -186,18 +208,20 @@ def _refused_joints(mj_model):
 
 
 def _refused_actuators(mj_model):
-    """Yield the actuators that are no motors of hinges."""
+    """Yield the actuators that are neither motors nor servos of hinges."""
     mujoco = mujoco_module()
     for actuator in range(mj_model.nu):
         joint = mj_model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
         hinge = joint and mj_model.jnt_type[mj_model.actuator_trnid[actuator, 0]] == mujoco.mjtJoint.mjJNT_HINGE
         plain = (
             mj_model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
-            and mj_model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
+            and mujoco.mjtBias(mj_model.actuator_biastype[actuator])
+            in (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
+            and (_bias(mj_model, [actuator])[1:] <= 0.0).all()
             and mj_model.actuator_dyntype[actuator] == mujoco.mjtDyn.mjDYN_NONE
         )
         if not (hinge and plain) or mj_model.actuator_forcelimited[actuator]:
-            yield f"actuator {name_of(mj_model, 'actuator', actuator)} is no motor of a hinge"
+            yield f"actuator {name_of(mj_model, 'actuator', actuator)} is no motor or servo of a hinge"
 
 
 def _refused_others(mj_model, data):

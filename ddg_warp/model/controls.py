@@ -168,7 +168,7 @@ def _refuse_missing(model, inputs: dict[str, np.ndarray]) -> None:
     if "angles" in inputs:
         for hinge in np.flatnonzero(~model.drives.driven & inputs["angles"].any(0))[:1]:
             raise SceneError(
-                f"Controls: angles: hinge {hinge} has no driven angle; give 0, or add it by scene.hinge(..., angle=0.0)"
+                f"Controls: angles: hinge {hinge} has no driven angle; give 0, or add it by scene.hinge(..., angle=0.0), or a spring"
             )
     if "wrenches" in inputs and not model.scene.bodies:
         raise SceneError("Controls: wrenches of no rigid body; add one by scene.add_body(...)")

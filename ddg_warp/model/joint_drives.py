@@ -14,12 +14,12 @@ class JointDrives:
 
     Attributes:
         joints: the hinges, `BodyJoint`, in the order of `Controls.angles`.
-        driven: mask of hinges with a driven angle (hinges,).
+        driven: mask of hinges with a driven angle, or with a spring (hinges,).
     """
 
     def __init__(self, model):
         self.joints = [joint for joint in model.scene.body_joints if joint.call == "hinge"]
-        self.driven = np.array([joint.angle is not None for joint in self.joints], bool)
+        self.driven = np.array([joint.angle is not None or joint.spring is not None for joint in self.joints], bool)
         self._worlds, self._tables = model.worlds, []
         numbers = [i for i, joint in enumerate(model.scene.body_joints) if joint.call == "hinge"]
         for part in model.coupled.sets if numbers else ():

@@ -66,8 +66,9 @@ class BodyJoint:
         call: "ball", "hinge" or "weld".
         first, second: bodies, -1 for the world.
         point: common point at rest (3,) [m]; axis: unit vector (3,) of a hinge at rest.
-        angle: of `second` relative to `first` about the axis [rad], one number or a function of time; None if free.
+        angle: of `second` relative to `first` about the axis [rad], one number or a function of time; None if free, or zero.
         torque: on `second` about the axis [N m], one number or a function of time; None without.
+        spring: torsional stiffness between the angle of the bodies and `angle` [N m], None if `angle` is met exactly.
         damping: [N m s]; stops: least and largest angle [rad], None without.
         stiffness: of the separation [N/m], None for the default.
         name: "" without.
@@ -80,6 +81,7 @@ class BodyJoint:
     axis: np.ndarray
     angle: float | Callable[[float], float] | None
     torque: float | Callable[[float], float] | None
+    spring: float | None
     damping: float
     stops: tuple[float, float] | None
     stiffness: float | None
@@ -184,6 +186,7 @@ class RigidBodies:
         axis: Vector,
         angle: float | Callable[[float], float] | None = None,
         torque: float | Callable[[float], float] | None = None,
+        spring: float | None = None,
         damping: float = 0.0,
         stops: tuple[float, float] | None = None,
         stiffness: float | None = None,
@@ -200,16 +203,22 @@ class RigidBodies:
             axis: direction at rest (3,).
             angle: driven angle, one number or a function of time [rad]; `Controls.angles` replaces it step by step.
             torque: on `second` about the axis, and the opposite one on `first`: one number, or a function of time [N m].
+            spring: torsional stiffness [N m]. `angle`, zero by default, is then that of the relaxed spring, and may have a torque,
+                damping and stops beside it: a servo motor.
             damping: torque against the angular rate [N m s].
             stops: least and largest angle [rad].
             stiffness: of the separation [N/m], see `ball`; angles have this times the square of the arm.
             name: of the joint.
 
         Raises:
-            SceneError: a body does not exist, both are one, or the angle has a torque or stops, too.
+            SceneError: a body does not exist, both are one, or the angle has a torque or stops, but no spring.
         """
-        if angle is not None and (torque is not None or damping or stops is not None):
-            raise SceneError("hinge: a driven angle leaves nothing to a torque, damping or stops; leave these out")
+        if spring is not None:
+            spring = argument_checks.number("hinge: spring", spring, "zero or more [N m]", lambda v: v >= 0.0)
+        elif angle is not None and (torque is not None or damping or stops is not None):
+            raise SceneError(
+                "hinge: a driven angle leaves nothing to a torque, damping or stops; leave these out, or give a spring"
+            )
         argument_checks.number("hinge: damping", damping, "zero or more [N m s]", lambda v: v >= 0.0)
         if stops is not None:
             lower, upper = argument_checks.broadcast("hinge: stops", stops, (2,))
@@ -223,7 +232,7 @@ class RigidBodies:
                 argument_checks.value_at(f"hinge: {label}", value, 0.0, error=SceneError)
             elif value is not None:
                 argument_checks.number(f"hinge: {label}", value)
-        options = {"angle": angle, "torque": torque, "damping": float(damping), "stops": stops}
+        options = {"angle": angle, "torque": torque, "spring": spring, "damping": float(damping), "stops": stops}
         return self._add_joint("hinge", first, second, point, axis, stiffness=stiffness, name=name, **options)
 
     def weld(
@@ -262,7 +271,7 @@ class RigidBodies:
         if stiffness is not None:
             stiffness = argument_checks.positive(f"{call}: stiffness", stiffness, "N/m")
         name = name and argument_checks.text(f"{call}: name", name)
-        free = {"angle": None, "torque": None, "damping": 0.0, "stops": None}
+        free = {"angle": None, "torque": None, "spring": None, "damping": 0.0, "stops": None}
         self.body_joints.append(
             BodyJoint(call, first, second, point, axis, **(free | drive), stiffness=stiffness, name=name)
         )

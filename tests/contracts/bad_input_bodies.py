@@ -113,6 +113,7 @@ for _call in ("ball", "hinge", "weld"):
 each("joints of bodies", "axis", [(0.0, 0.0, 0.0), 3.0, (0.0, NAN, 1.0)], lambda v: hinged(axis=v), "hinge: axis")
 each("joints of bodies", "torque", ["much", NAN, (1.0, 2.0)], lambda v: hinged(torque=v), "hinge: torque")
 each("joints of bodies", "damping", [-1.0, NAN, INF, "much"], lambda v: hinged(damping=v), "hinge: damping", "zero or more")
+each("joints of bodies", "spring", [-1.0, NAN, INF, "soft"], lambda v: hinged(spring=v), "hinge: spring", "zero or more")
 each("joints of bodies", "angle", ["open", NAN, (1.0, 2.0)], lambda v: hinged(angle=v), "hinge: angle")
 each("joints of bodies", "stops", [(0.5, 1.0), (-1.0, -0.5), (0.0, 0.0), (1.0, -1.0)], lambda v: hinged(stops=v), "hinge: stops",
      "with 0 between them")

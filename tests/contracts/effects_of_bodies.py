@@ -75,7 +75,7 @@ body_call("ball", PINNED, {
     three_bodies)  # fmt: skip
 body_call("hinge", PINNED | {"axis": (0.0, 1.0, 0.0)}, {
     "first": SECOND, "second": SECOND, "point": (0.0, 0.1, 0.0), "axis": TILTED, "angle": lambda t: 3.0 * t, "torque": 1.0,
-    "damping": 0.1, "stops": (-1e-3, 1e-3), "stiffness": Change(10.0, PAIR, 1e4), "name": "odd"},
+    "spring": 0.5, "damping": 0.1, "stops": (-1e-3, 1e-3), "stiffness": Change(10.0, PAIR, 1e4), "name": "odd"},
     three_bodies)  # fmt: skip
 body_call("weld", {"first": FIRST, "second": SECOND}, {
     "first": THIRD, "second": THIRD, "point": (0.5, 0.1, 0.0), "stiffness": 10.0, "name": "odd"},

@@ -148,14 +148,16 @@ def test_a_missing_package_names_the_extra(monkeypatch):
 PENDULUM = f"""<mujoco><option timestep="%g" gravity="0 0 -{GRAVITY}" integrator="RK4"><flag contact="disable"/></option><worldbody>
     <body name="upper"><joint name="shoulder" axis="0 1 0" damping="%g"/>
     <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="0.4"/>
-    <body name="lower" pos="0.3 0 0"><joint name="elbow" axis="0 1 0"/>
+    <body name="lower" pos="0.3 0 0"><joint name="elbow" axis="0 1 0" stiffness="0.5" springref="20"/>
     <geom type="box" pos="0.1 0 0.02" size="0.1 0.02 0.03" mass="0.2"/>
     <body name="cap" pos="0.2 0 0"><geom type="sphere" size="0.03" mass="0.1"/></body></body></body></worldbody>
-    <actuator><motor name="drive" joint="elbow" gear="0.5" ctrlrange="-1 1" ctrllimited="true"/></actuator></mujoco>"""
+    <actuator><motor name="drive" joint="elbow" gear="0.5" ctrlrange="-1 1" ctrllimited="true"/>
+    <position name="servo" joint="shoulder" kp="2" kv="0.05"/><velocity name="brake" joint="elbow" kv="0.01" gear="0.5"/>
+    </actuator></mujoco>"""
 
 
 def test_double_pendulum_agrees_with_mujoco(mujoco):
-    """Positions after 1 s agree with fine steps of MuJoCo, to second order in the step, damped and driven."""
+    """Positions after 1 s agree with fine steps of MuJoCo, to second order in the step, with motor, servos, damping and spring."""
 
     def drive(t):
         return 1.5 * np.sin(8.0 * t)
@@ -169,7 +171,9 @@ def test_double_pendulum_agrees_with_mujoco(mujoco):
     errors = []
     for dt in (4e-3, 2e-3):
         scene = ddg.Scene(gravity=(0, 0, -GRAVITY))
-        added = ddg.coupling.add_bodies(scene, PENDULUM % (1e-3, 0.01), ctrl={"drive": drive})
+        added = ddg.coupling.add_bodies(
+            scene, PENDULUM % (1e-3, 0.01), ctrl=dict.fromkeys(("drive", "servo", "brake"), drive)
+        )
         assert list(added.joints) == ["shoulder", "elbow"]
         assert added.bodies["cap"] == added.bodies["lower"]
         model = scene.build(device="cpu")
@@ -185,10 +189,10 @@ def test_unsupported_joints_and_actuators_are_listed_at_once(mujoco):
     xml = f"""{HEAD % 1e-3}<body name="cart"><joint name="rail" type="slide" axis="1 0 0"/><geom size="0.1"/>
         <body name="arm"><joint name="spring" axis="0 1 0" stiffness="1" armature="0.1"/>
         <geom name="tube" type="cylinder" size="0.1 0.2"/></body></body></worldbody>
-        <actuator><position name="servo" joint="spring"/></actuator></mujoco>"""
+        <actuator><position name="servo" joint="rail"/><general name="lag" joint="spring" dyntype="filter"/></actuator></mujoco>"""
     with pytest.raises(ddg.SceneError) as refused:
         ddg.coupling.add_bodies(ddg.Scene(), xml)
-    for text in ("rail is a slide", "spring has a stiffness", "spring has armature", "servo is no motor"):
+    for text in ("rail is a slide", "spring has armature", "servo is no motor", "lag is no motor"):
         assert text in str(refused.value)
     assert "tube" not in str(refused.value)
 

@@ -23,6 +23,7 @@ def joint_sets(scene, coupled) -> list[CoupledSet]:
         else:
             term, angular = JOINTS["hinge"], k * arm**2
             about = angular if joint.call == "weld" or joint.angle is not None else 0.0
+            about = about if joint.spring is None else joint.spring
             lower, upper = joint.stops or (-NO_STOP, NO_STOP)
             values = term.bind(
                 measure=1.0,
