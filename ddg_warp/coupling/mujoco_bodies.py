@@ -133,7 +133,7 @@ def _add_joint(scene, mj_model, data, joint: int, parent: Handle | None, child: 
 
 @dataclass(frozen=True)
 class _Torque:
-    """Torque of motors and servos, except the part by angle and rate [N m], a function of time.
+    """Torque of motors and servos at zero angle and rate [N m], a function of time.
 
     Attributes:
         motors: control (number or function of time), least and largest control, and factor, of each actuator.
