@@ -1,12 +1,14 @@
 """Settings of the site; blocks of its pages are filled by `expand`, from results, scenes and docstrings."""
 
 import re
+import subprocess
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from expand import expand
+from expand import expand, played
 
 import ddg_warp
 
@@ -25,6 +27,18 @@ def setup(app) -> None:
     """Fill blocks of pages, and make docstrings valid reStructuredText."""
     app.connect("source-read", lambda _app, _page, source: source.__setitem__(0, expand(source[0])))
     app.connect("autodoc-process-docstring", escape)
+    app.connect("build-finished", play)
+
+
+def play(app, error: Exception | None) -> None:
+    """Run the scenes that the gallery plays, and write their pages to `play/` of the site; pages that exist stay."""
+    for name in [] if error else played():
+        page = Path(app.outdir) / "play" / f"{name}.html"
+        if page.exists():
+            continue
+        with TemporaryDirectory() as run:
+            for command in (["run", name, "--out", run, "--force"], ["view", run, "--save", page]):
+                subprocess.run([sys.executable, "-m", "ddg_warp", *command], check=True, stdout=subprocess.DEVNULL)
 
 
 def escape(_app, _kind, _name, _object, _options, lines: list[str]) -> None:

@@ -14,10 +14,12 @@ import ast
 import csv
 import math
 import re
+from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "tools" / "results"
+PLAYED = "active_gripper", "spring_car"  # scenes of the gallery with a page that plays them
 BLOCK = re.compile(r"^```\{(results|scenes|derivation|reference)\} ?(.*)\n((?:.*\n)*?)```$", re.M)
 
 
@@ -70,6 +72,11 @@ def results(file: str, body: str) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in table)
 
 
+def played() -> tuple[str, ...]:
+    """Return the scenes to play on the site; none without the extra `view`."""
+    return PLAYED if find_spec("viser") else ()
+
+
 def scenes(_argument: str, _body: str) -> str:
     """Return a section for every scene: its picture, command, docstring and checks."""
     from ddg_warp.run.scene_registry import scene_files
@@ -84,6 +91,8 @@ def scene(name: str, path: Path) -> str:
     lines = [f"## {name}", ""]
     if (picture := RESULTS / "gallery" / f"{name}.png").exists():
         lines += [f"![Picture of the scene {name}](../results/gallery/{picture.name})", ""]
+    if name in played():
+        lines += [f'<a href="play/{name}.html">Play it</a>', ""]
     lines += [markdown(ast.get_docstring(tree) or ""), "", f"    ddg-warp run {name}", ""]
     if "check" in functions:
         lines += [f"**Check.** {markdown(ast.get_docstring(functions['check']) or '')}", ""]
