@@ -36,6 +36,7 @@ def play(app, error: Exception | None) -> None:
         page = Path(app.outdir) / "play" / f"{name}.html"
         if page.exists():
             continue
+        page.parent.mkdir(exist_ok=True)
         with TemporaryDirectory() as run:
             for command in (["run", name, "--out", run, "--force"], ["view", run, "--save", page]):
                 subprocess.run([sys.executable, "-m", "ddg_warp", *command], check=True, stdout=subprocess.DEVNULL)
