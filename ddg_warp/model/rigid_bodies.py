@@ -96,6 +96,14 @@ def body_states(state, chosen=slice(None)) -> BodyState:
     return BodyState(position, rotation @ to_rest, velocity, np.einsum("wbij,wbj->wbi", rotation, rates))
 
 
+def body_rates(state) -> wp.array:
+    """Return the velocities of dof blocks of a `State` (W N,), with angular velocities at rotations of rigid bodies."""
+    v, host = state.coupled.v, state.model.coupled.host.rigid_bodies
+    values = v.numpy().reshape(state.model.worlds, -1, 3)
+    values[:, host.spins] = body_states(state).angular_velocity
+    return wp.array(values.reshape(-1, 3), dtype=v.dtype, device=v.device)
+
+
 def _rotations_and_momenta(state) -> tuple[np.ndarray, np.ndarray]:
     """Return orientations (worlds, bodies, 3, 3) and angular momenta (worlds, bodies, 3) [kg m^2/s] of a `State`."""
     arrays = (array.numpy().astype(float) for array in (state.coupled.rotation, state.coupled.momentum))

@@ -12,7 +12,7 @@ from ddg_warp import device_arrays as arrays
 from ddg_warp.capture_lock import launches
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry import polyline
-from ddg_warp.model.rigid_bodies import BodyState, body_state, body_states
+from ddg_warp.model.rigid_bodies import BodyState, body_rates, body_state, body_states
 from ddg_warp.scene.descriptions import Dynamics
 from ddg_warp.scene.handle import BODY, OBSTACLE, Handle, named
 from ddg_warp.typing import Array, Bools, Device, Floats, Names
@@ -202,8 +202,10 @@ class State:
 
     @property
     def slip_velocity(self) -> wp.array:
-        """Slip velocities of dof blocks (W N,) for friction."""
-        return self.coupled.v if self.sliding is None else self.sliding.velocity
+        """Slip velocities of dof blocks (W N,) for friction, at rotations of rigid bodies their angular velocities."""
+        if self.sliding is not None:
+            return self.sliding.velocity
+        return body_rates(self) if self.model.scene.bodies else self.coupled.v
 
     def points(self, item: int | str | Sequence[int] | None = None) -> Floats:
         """Return positions (P, 3) or (worlds, P, 3) [m]: nodes in the order of `model.curves`, then vertices.

@@ -353,8 +353,9 @@ class FrictionSample(ContactSample):
         slip = [wp.zeros((2, self.COUNT), dtype=pair, device=device) for _ in range(2)]
         no_pair, no_four, no_vector, no_table = self._nothing(real)
         more, none = wp.zeros(self.COUNT, dtype=real, device=device), self._put([0], int)
-        inputs = [1, pairs, count, *law, x, no_pair, no_table, no_four, no_pair, no_pair, contact, push, 0, more, none]
-        kernel = lag_kernel(self.collision, real, real, False, False, False)
+        inputs = [1, pairs, count, *law, x, no_pair, no_table, no_four, no_pair, no_pair, none]
+        inputs += [contact, push, 0, more, none]
+        kernel = lag_kernel(self.collision, real, real, False, False, False, False)
         wp.launch(kernel, 1, inputs, [wp.zeros_like(pairs), factor, lagged, *slip], device=device)
         q, start, rate = (
             self._put(data[name], dtype) for name, dtype in (("q", vector), ("start", vector), ("rate", real))
@@ -362,7 +363,7 @@ class FrictionSample(ContactSample):
         energy, work, gradient = *(wp.zeros(self.COUNT, dtype=real, device=device) for _ in range(2)), self._parts(real)
         no_count = self._put([], int)
         inputs = [1, pairs, count, 1, lagged, VELOCITY, rate, no_count, no_count, 0, q, start, no_vector]
-        kernel = friction_kernel(self.friction, real, real, False, False, False)
+        kernel = friction_kernel(self.friction, real, real, False, False, False, False)
         wp.launch(kernel, 1, inputs, [*slip, factor, energy, work, gradient], device=device)
         return energy, gradient, factor
 

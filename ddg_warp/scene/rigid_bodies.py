@@ -121,8 +121,8 @@ class RigidBodies:
             name: name for queries; bodies of one name have common contact parameters.
 
         Attach rods and shells with `attach`. With `contact` the shapes collide with rods, shells, obstacles and other bodies. They
-        do not collide with the rods and shells that the body carries, nor with bodies that a joint connects to it. Friction acts at
-        the centre of a `Sphere` and on the axis of a `Capsule`, which it does not roll; give such bodies a `Mesh`.
+        do not collide with the rods and shells that the body carries, nor with bodies that a joint connects to it. Friction acts on
+        the surfaces, and so rolls bodies.
 
         Raises:
             SceneError: a shape without volume, an inertia that no body has, or a missing quantity; the message names it.

@@ -12,7 +12,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.collision.contact.assembly import set_struct
+from ddg_warp.kernels.collision.contact.assembly import row_functions, set_struct, unpacked
 from ddg_warp.kernels.collision.contact.hessian_product import total_function
 from ddg_warp.kernels.core.division import nonzero_function
 from ddg_warp.kernels.core.inertia import mass_type
@@ -204,12 +204,33 @@ def contact_kernels(real, linear):
     """Build the kernels of contact on carried nodes, one thread a body.
 
     `gather`: add products of pairs at carried nodes to the products of the bodies, and p . H p of their blocks.
-    `condense`: write the diagonal blocks of bodies, and the block between origin and rotation, from the blocks of carried nodes.
+    `condense`: write the diagonal blocks of bodies, and the block between origin and rotation, from the blocks of carried nodes, and
+        from friction that rotates the bodies.
     `condense_product`: add products at carried nodes to the products of the bodies.
     """
     M, H = wp.types.matrix((3, 3), linear), wp.types.vector(3, linear)
     Bodies, PairSet, total = bodies_type(real), set_struct(real, linear), total_function(real, linear)
     _, free = product_functions(linear)
+    row_of, direction_of, weight_of = row_functions(linear)
+
+    @wp.func
+    def between(sets: wp.array(dtype=PairSet), node: int):
+        """Return the block of friction between a carried node and the rotation of the body."""
+        m = M()
+        for s in range(sets.shape[0]):
+            if sets[s].rotations.shape[0] > 0 and sets[s].numbers[node] > 0:
+                pair_set = sets[s]
+                start = pair_set.places[node]
+                for i in range(start, start + pair_set.numbers[node]):
+                    p, local = unpacked(pair_set.items[i])
+                    side = wp.where(local < wp.where(pair_set.edges > 0, 2, 1), 0, 1)
+                    used = pair_set.used[p]
+                    for k in range(pair_set.rows):
+                        if used != 0 and (used >> (k + 1)) & 1 != 0:
+                            row = row_of(pair_set.row, k, p)
+                            scale = weight_of(row)[local] * pair_set.radii[p][side]
+                            m += wp.outer(direction_of(row) * scale, pair_set.spin[k, p])
+        return m
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def gather(
@@ -243,17 +264,28 @@ def contact_kernels(real, linear):
         dots_out[w, s] = wp.dot(p[j], y)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
-    def condense(bodies: Bodies, blocks: int, diagonal: wp.array(dtype=M), cross: wp.array(dtype=M)):
+    def condense(
+        bodies: Bodies,
+        sets: wp.array(dtype=PairSet),
+        blocks: int,
+        diagonal: wp.array(dtype=M),
+        cross: wp.array(dtype=M),
+    ):
         """`cross`: block between origin and rotation, at the rotation's block."""
         w, b = wp.tid()
         carried = w * bodies.carried.shape[0]
         translation, rotation, mixed = M(), M(), M()
+        for s in range(sets.shape[0]):
+            if sets[s].numbers[bodies.spins[b] + w * blocks] > 0:
+                rotation = diagonal[bodies.spins[b] + w * blocks]
         for j in range(bodies.starts[b], bodies.starts[b + 1]):
-            K = diagonal[bodies.carried[j] + w * blocks]
+            node = bodies.carried[j] + w * blocks
+            K = diagonal[node]
+            B = between(sets, node)
             D = M(bodies.derivative[j + carried])
             translation += K
-            mixed += K * D
-            rotation += wp.transpose(D) * K * D
+            mixed += K * D + B
+            rotation += wp.transpose(D) * (K * D + B) + wp.transpose(B) * D
         diagonal[bodies.origins[b] + w * blocks] = translation
         diagonal[bodies.spins[b] + w * blocks] = rotation
         cross[bodies.spins[b] + w * blocks] = mixed

@@ -138,24 +138,25 @@ def predict_kernel(real, midpoint: bool):
 
 @cache
 def turn_kernel(real):
-    """Build the kernel `turn`: write the rotation vector of every body from R_n to P into the iterate.
+    """Build the kernel `turn`: write the rotation vector of every body from one orientation to another into its dofs.
 
-    Ghosts of the rods that bodies clamp follow by it, before the dofs count from P.
+    From R_n to P, ghosts of the rods that bodies clamp follow by it, before the dofs count from P. From P to R_n it is where slips
+    start.
     """
     V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
     _, vector, _ = rotation_functions(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def turn(
-        rotation: wp.array(dtype=M),
-        predicted: wp.array(dtype=M),
+        start: wp.array(dtype=M),
+        end: wp.array(dtype=M),
         spins: wp.array(dtype=int),
         blocks: int,
         q: wp.array(dtype=V),
     ):
         w, b = wp.tid()
         i = w * spins.shape[0] + b
-        q[spins[b] + w * blocks] = vector(predicted[i] * wp.transpose(rotation[i]))
+        q[spins[b] + w * blocks] = vector(end[i] * wp.transpose(start[i]))
 
     return turn
 

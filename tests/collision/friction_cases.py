@@ -8,7 +8,7 @@ from pair_cases import CASES, bundle, central, hessian_product, terms
 MU, RATE, VELOCITY = 0.4, 100.0, 0.01
 SLIP = VELOCITY / RATE  # slip at which the polynomial law slides [m]
 SLIPS = {"logistic": 0.15 * SLIP, "polynomial": 0.7 * SLIP}  # slips at which some pairs stick and others slide [m]
-ROLLING = "rolling"  # parallel rods with twist angles
+ROLLING = "rolling"  # parallel rods with twist angles, among surfaces of rigid bodies
 each_case = pytest.mark.parametrize("case", CASES)
 each_form = pytest.mark.parametrize("form", ["logistic", "polynomial"])
 

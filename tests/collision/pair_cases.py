@@ -25,14 +25,15 @@ def bundle(
 ) -> tuple[CollisionMesh, np.ndarray]:
     """Return rods side by side over a strip of triangles, parallel to 1 in 500.
 
-    Mollifiers are between 0 and 1. With `rolls` all rods but the last have twist angles, stored at the end.
+    Mollifiers are between 0 and 1. With `rolls` all rods but the last have twist angles, stored at the end. The last rod and the strip
+    are then surfaces of rigid bodies, with the last two blocks as rotations.
     """
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.linspace(0.0, 0.2, edges + 1), np.arange(rods) * 0.0062)
     sides = np.stack([x + 0.011 * np.arange(rods)[:, None], y, 0.0 * x], 2).reshape(-1, 3)
     i, j = np.meshgrid(np.arange(4), np.arange(3), indexing="ij")
     strip = np.stack([0.02 + 0.05 * i, -0.005 + 0.01 * j, np.full(i.shape, -0.0056)], 2).reshape(-1, 3)
-    rest = np.concatenate([sides, strip, np.zeros(((rods - 1) * edges * rolls, 3))])
+    rest = np.concatenate([sides, strip, np.zeros((((rods - 1) * edges + 2) * rolls, 3))])
     shapes = CollisionMesh(rest)
     for r in range(rods):
         angles = len(sides) + len(strip) + r * edges + np.arange(edges) if rolls and r < rods - 1 else None
@@ -42,6 +43,8 @@ def bundle(
         [np.stack([first, first + 3, first + 1], 1), np.stack([first + 3, first + 4, first + 1], 1)]
     )
     shapes.shell(triangles, 0.004)
+    for number in (rods - 1, rods) if rolls else ():
+        shapes.rotate(number, len(rest) - rods - 1 + number)
     return shapes, rest + rng.normal(size=rest.shape) * jitter
 
 

@@ -1,7 +1,5 @@
 """Contact of rigid balls with each other, without rods and shells."""
 
-import warnings
-
 import numpy as np
 import pytest
 
@@ -72,21 +70,3 @@ def test_one_ball_alone_is_refused():
     scene.contact(range=1e-3)
     with pytest.raises(ddg.SceneError, match="one ball alone"):
         scene.build(device="cpu")
-
-
-def test_friction_of_a_ball_warns():
-    """A ball with friction at the centre does not roll; a mesh does."""
-    for shape, warned in (
-        (ddg.Sphere((0, 0, 0.0205), 0.02), 1),
-        (ddg.Mesh(*ddg.meshes.sphere(1, 0.02), radius=1e-3), 0),
-    ):
-        scene = ddg.Scene()
-        scene.add_obstacle(ddg.Plane((0, 0, -0.01)), name="floor")
-        scene.add_body(shape, density=1000.0, name="odd")
-        scene.contact(range=1e-3, friction=0.3)
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            scene.build(device="cpu")
-        texts = [str(entry.message) for entry in caught if entry.category is ddg.SceneWarning]
-        assert len(texts) == warned
-        assert all("body 0 ('odd')" in text and "does not roll" in text for text in texts)

@@ -79,10 +79,10 @@ def test_incidence_items_are_sorted(device, kind):
     inputs = [wp.array(values, dtype=int, device=device) for values in ([count], starts, numbers, mixed)]
     inputs.insert(1, wp.array(nodes, dtype=wp.vec4i, device=device))
     none = wp.zeros(0, dtype=wp.vec2i, device=device)
-    inputs[2:2] = none, wp.zeros(4000, dtype=wp.uint8, device=device)
+    inputs[2:2] = none, none, wp.zeros(4000, dtype=wp.uint8, device=device)
     ordered = wp.zeros(len(items), dtype=int, device=device)
     ranks = wp.zeros(count, dtype=wp.vec4i, device=device)
     *_, sort = list_kernels(kind, False)
-    wp.launch(sort, count, [count, *inputs], [ordered, ranks, none], device=device)
+    wp.launch(sort, count, [count, *inputs], [ordered, ranks, none, none], device=device)
     assert (ordered.numpy() == wanted).all()
     assert (wanted[ranks.numpy()[:, :size]].ravel() == items).all()

@@ -225,13 +225,15 @@ def test_rolling_edges_next_to_clamped_edges_converge(device):
 @each_form
 def test_forces_and_products_equal_central_differences(device, form):
     result, positions, _, after = friction_terms(ROLLING, device, form)
-    assert sum((part.factor.angles.numpy()[: int(part.count.numpy()[0])] >= 0).sum() for part in result.frictions) > 20
+    for name in ("angles", "rotations"):
+        blocks = (getattr(part.factor, name).numpy()[: int(part.count.numpy()[0])] for part in result.frictions)
+        assert sum((each >= 0).sum() for each in blocks) > 20
     assert_central_differences(result, positions, after)
 
 
 @each_form
 def test_blocks_equal_the_matrix(device, form):
-    """Blocks are of nodes and angles with themselves, of neighbouring angles, and of edges with both nodes."""
+    """Blocks are of nodes, angles and rotations with themselves, of neighbouring angles, and of edges with both nodes."""
     result, *_ = friction_terms(ROLLING, device, form)
     n, shapes = len(result.forces), result.search.shapes
     matrix, diagonal = assembled_hessian(result, n).transpose(0, 2, 1, 3), result.blocks.diagonal.numpy()
@@ -245,7 +247,8 @@ def test_blocks_equal_the_matrix(device, form):
     rolling = np.flatnonzero(angles >= 0)
     assert np.abs(first).max() > 1e-3 * largest and np.abs(neighbour).max() > 1e-7 * largest
     index = np.arange(n)
-    assert np.abs(diagonal[angles[rolling]] - matrix[index, index][angles[rolling]]).max() < 1e-13 * largest
+    turning = np.append(angles[rolling], shapes.body_rotations[-2:])
+    assert np.abs(diagonal[turning] - matrix[index, index][turning]).max() < 1e-13 * largest
     for e in rolling:
         # neighbouring edges of a rod are no pair of one edge: rows of two rods alone have both
         assert np.abs(first[e] - matrix[angles[e], nodes[e, 0], 0]).max() < 1e-13 * largest

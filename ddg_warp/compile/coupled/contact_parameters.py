@@ -1,15 +1,13 @@
 """Contact of the coupled system: collision bodies and parameters of pairs of groups."""
 
-import warnings
-
 import numpy as np
 
 from ddg_warp.compile.collision_bodies import ROD, Body, ContactParameters
 from ddg_warp.compile.coupled.system import CoupledSystem
 from ddg_warp.compile.laws import contact_law
-from ddg_warp.errors import SceneError, SceneWarning
+from ddg_warp.errors import SceneError
 from ddg_warp.scene.contact import Contact, contact_names
-from ddg_warp.scene.obstacles import BALL, CAPSULE, MESH
+from ddg_warp.scene.obstacles import BALL, MESH
 
 HALF = 0.5  # default activation distance over the smallest radius
 
@@ -81,24 +79,10 @@ def contact_parameters(scene, coupled: CoupledSystem) -> ContactParameters | Non
             f"contact: {bodies[0].label}, one ball alone, meets nothing; add an obstacle, a rod, a shell or a body"
         )
     result = _numbers(scene, law, bodies, *scale_mass)
-    _warn_of_sliding(result)
     if law.rolling and not (result.has_friction and any(body.angles.size for body in bodies)):
         lacking = "no rod is in contact" if result.has_friction else "there is no friction"
         raise SceneError(f"contact: rolling, and {lacking}; leave rolling out")
     return result
-
-
-def _warn_of_sliding(contact: ContactParameters) -> None:
-    """Warn of rigid balls and capsules with friction, which acts on the center or the axis and rotates neither."""
-    for body, group in zip(contact.bodies, contact.group.tolist(), strict=True):
-        if body.rigid >= 0 and body.kind in (BALL, CAPSULE) and contact.friction[group].any():
-            warnings.warn(
-                f"contact: friction acts at the {'center' if body.kind == BALL else 'axis'} of {body.label}, which does not roll: "
-                "give it a Mesh, such as Mesh(*meshes.sphere(2, radius)), or no friction",
-                SceneWarning,
-                stacklevel=5,
-            )
-            return
 
 
 def _radii_and_forces(batch, radius: float | None) -> tuple[list[float], list[float]]:

@@ -34,6 +34,7 @@ class CollisionMesh:
         self._angles: dict[int, np.ndarray] = {}
         self.ignored_pairs: set[tuple[int, int]] = set()
         self.spinning: dict[int, np.ndarray] = {}
+        self._rotations: dict[int, int] = {}
 
     def rod(
         self,
@@ -149,6 +150,10 @@ class CollisionMesh:
             )
         self.spinning[number] = nodes
 
+    def rotate(self, number: int, block: int) -> None:
+        """Let friction rotate an object by a dof block, the rotation vector of a rigid body."""
+        self._rotations[number] = block
+
     def ignore(self, first: int, second: int) -> None:
         """Exclude contact between two objects, or of an object with itself.
 
@@ -161,6 +166,11 @@ class CollisionMesh:
                     f"there is no object {number}; objects are 0 to {len(self.names) - 1}, in the order added"
                 )
         self.ignored_pairs.add((min(first, second), max(first, second)))
+
+    @property
+    def body_rotations(self) -> np.ndarray:
+        """Rotation blocks of objects that are surfaces of rigid bodies, -1 for others (objects,)."""
+        return np.array([self._rotations.get(number, -1) for number in range(len(self.names))])
 
     @property
     def ignored(self) -> np.ndarray:

@@ -18,24 +18,33 @@ class CollisionSet:
     Args:
         candidates: list of a search, with the kind and capacity of the pairs.
         nodes: nodes of all worlds; silent: nodes of a world that receive nothing.
-        linear: type of factors; rolls: True if pairs rotate rods.
+        linear: type of factors; rolls, rotates: True if pairs rotate rods, or rigid bodies.
 
     Attributes:
         `factor`: see `assembly.factor_struct`.
-        `energy`, `gradient`: of each pair (capacity,) [J]; by local node or angle (`PAIR_NODES` or `ITEMS`, capacity) [N, N m].
+        `energy`, `gradient`: of each pair (capacity,) [J]; by local index (`PAIR_NODES` or `ITEMS`, capacity) [N, N m].
         `placed`, `idle`: see `assembly.set_struct`.
         `pairs`, `count`, `starts`, `partners`: as of `CandidateList`.
         `mollified`: near-parallel edges (`NearParallelEdges`) with exact Hessians; None without.
-        `numbers`, `places`, `items`, `ranks`, `angle_ranks`: as of `Incidence`, whose lists the subclass builds.
+        `numbers`, `places`, `items`, `ranks`, `angle_ranks`, `rotation_ranks`: as of `Incidence`, whose lists the subclass builds.
     """
 
     mollified = None
 
     def __init__(
-        self, candidates: CandidateList, rows: int, nodes: int, real, linear, silent: wp.array, rolls: bool = False
+        self,
+        candidates: CandidateList,
+        rows: int,
+        nodes: int,
+        real,
+        linear,
+        silent: wp.array,
+        rolls: bool = False,
+        rotates: bool = False,
     ):
         self.found, self.device, self.rows, self.real, self.linear = candidates, candidates.device, rows, real, linear
-        self.rolls, self._items = rolls, Incidence(candidates.kind, nodes, silent, rolls)
+        self.rolls, self.rotates = rolls, rotates
+        self._items = Incidence(candidates.kind, nodes, silent, rolls, rotates)
         self.numbers, self.places = self._items.numbers, self._items.places
         self.factor = assembly.factor_struct(linear)()
         self.count = wp.zeros(1, dtype=int, device=self.device)
@@ -62,14 +71,21 @@ class CollisionSet:
             (self.rows, capacity), wp.types.vector(assembly.ROW, linear), self.device
         )
         self.energy = wp.zeros(capacity, dtype=self.real, device=self.device)
-        items, angle_capacity = (assembly.ITEMS, capacity) if self.rolls else (assembly.PAIR_NODES, 0)
+        items = assembly.ITEMS if self.rolls or self.rotates else assembly.PAIR_NODES
+        angle_capacity, rotation_capacity = capacity * self.rolls, capacity * self.rotates
         self.gradient = device_arrays.allocate((items, capacity), wp.types.vector(3, self.real), self.device)
         self.factor.angles = wp.zeros(angle_capacity, dtype=wp.vec2i, device=self.device)
         self.factor.lever = device_arrays.allocate(
             (self.rows, angle_capacity), wp.types.vector(assembly.ANGLES, linear), self.device
         )
+        self.factor.rotations = wp.zeros(rotation_capacity, dtype=wp.vec2i, device=self.device)
+        radii = wp.types.vector(assembly.BODIES, linear)
+        self.factor.radii = wp.zeros(rotation_capacity, dtype=radii, device=self.device)
+        spins = (self.rows, rotation_capacity)
+        self.factor.spin = device_arrays.allocate(spins, wp.types.vector(3, linear), self.device)
         self._items.reserve(capacity)
-        self.items, self.ranks, self.angle_ranks = self._items.items, self._items.ranks, self._items.angle_ranks
+        for name in ("items", "ranks", "angle_ranks", "rotation_ranks"):
+            setattr(self, name, getattr(self._items, name))
         self.idle = wp.zeros(capacity, dtype=wp.uint8, device=self.device)
         self.placed = wp.zeros(len(self.items), dtype=wp.types.vector(assembly.PLACED, linear), device=self.device)
 

@@ -11,7 +11,7 @@ class ContactBlocks:
     """Blocks of the Gauss-Newton matrix of a `ContactPotential`, assembled for preconditioners.
 
     Args:
-        rolls: whether friction rotates rods.
+        rolls, rotates: whether friction rotates rods, or rigid bodies.
 
     Attributes:
         diagonal: (worlds times nodes,) blocks at nodes, 3 x 3 [N/m]; stiffness: (worlds times nodes,) their traces [N/m].
@@ -21,7 +21,7 @@ class ContactBlocks:
             of the rod [N m]. Diagonal blocks of angles are in `diagonal`.
     """
 
-    def __init__(self, search, edges: int, linear, rolls: bool):
+    def __init__(self, search, edges: int, linear, rolls: bool, rotates: bool):
         self._device, self._edges, self._nodes = search.device, search.lists[0].first, len(search.shapes.points)
         nodes, edges, block = self._nodes * search.worlds, edges * search.worlds, wp.types.matrix((3, 3), linear)
 
@@ -34,7 +34,7 @@ class ContactBlocks:
         self.turned = [make(edges if rolls else 0, dtype) for dtype in types]
         angles = search.shapes.angles(2)[:, 0].astype(np.int32)
         self._angles = wp.array(angles if rolls else angles[:0], dtype=int, device=search.device)
-        made = collect_kernels(search.real, linear, device_arrays.serial(search.device), rolls)
+        made = collect_kernels(search.real, linear, device_arrays.serial(search.device), rolls, rotates)
         self._collect, self._join, self._roll = made
         self.kernels = [self._collect, self._join, *([self._roll] if rolls else [])]
 

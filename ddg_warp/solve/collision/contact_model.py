@@ -196,6 +196,8 @@ def shapes_of(host) -> CollisionMesh:
             number = shapes.rod(
                 body.nodes, body.radius, closed=body.closed, exclusion_length=exclusion, angles=angles, **options
             )
+        if body.rigid >= 0:
+            shapes.rotate(number, int(host.rigid_bodies.spins[body.rigid]))
         if body.markers.size:
             shapes.spin(number, np.append(body.nodes[0], body.markers))
     for first, second in _attached(host):

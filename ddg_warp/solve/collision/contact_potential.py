@@ -55,7 +55,7 @@ class ContactPotential:
         energy: (worlds,) [J], of contact and the potential of friction; forces: (worlds times nodes,) [N].
         gap: (worlds,) smallest gap of all candidates [m], at most the reach of the search; touching, dissipated: see `WorldSums`.
         blocks: the `ContactBlocks` of the matrix.
-        rolls: whether friction rotates rods.
+        rolls, rotates: whether friction rotates rods, or rigid bodies.
         start: positions and angles at the start of slip (worlds times nodes,), unless given to `evaluate`.
         more: addition to normal forces in friction (worlds,) [N], zero except for forced sticking.
         law: `law_struct`, on the device, with rates of inertia (worlds,) [1/s], initially zero; lag_law: law of the last friction lag.
@@ -114,7 +114,8 @@ class ContactPotential:
         self.frictions = self._with_friction(has_friction, ways, friction_law, velocity, silenced)
         self.start, self.more = wp.zeros_like(self.forces), wp.zeros_like(self.gap)
         self.rolls = any(part.rolls for part in self.frictions)
-        self.blocks = ContactBlocks(search, len(self.law.square), self.linear, self.rolls)
+        self.rotates = any(part.rotates for part in self.frictions)
+        self.blocks = ContactBlocks(search, len(self.law.square), self.linear, self.rolls, self.rotates)
         self.products = PairProduct(self._parts, self.law, self.real, self.linear)
         self._rub = PairProduct(self.frictions, self.law, self.real, self.linear) if self.frictions else None
         self._totals = totals = WorldSums(self.lists, self.frictions, search, self.real)

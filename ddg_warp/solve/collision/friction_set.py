@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import device_arrays
-from ddg_warp.kernels.collision.contact.assembly import ANGLES
+from ddg_warp.kernels.collision.contact.assembly import ANGLES, BODIES
 from ddg_warp.kernels.collision.friction.potential import ROWS, friction_kernel, lag_kernel, lagged_struct
 from ddg_warp.kernels.densities import Density
 from ddg_warp.solve.collision.collision_mesh import CollisionMesh
@@ -43,9 +43,10 @@ class FrictionSet(CollisionSet):
     ):
         candidates, kind = contact.found, contact.found.kind
         angles = [shapes.angles(primitives.size) for primitives in (candidates.first, candidates.second)]
-        super().__init__(candidates, ROWS, nodes, real, linear, silent, rolls=any((each >= 0).any() for each in angles))
+        rolls, rotations = any((each >= 0).any() for each in angles), shapes.body_rotations
+        super().__init__(candidates, ROWS, nodes, real, linear, silent, rolls, bool((rotations >= 0).any()))
         self._contact, self._velocity, self._spins = contact, velocity, spins
-        variant = coefficients is not None, spins.any, self.rolls
+        variant = coefficients is not None, spins.any, self.rolls, self.rotates
         self._lag = lag_kernel(kind, real, linear, *variant)
         self._evaluate = friction_kernel(density, real, linear, *variant)
         self._rows, neighbours = ROWS + (coefficients is not None), None
@@ -55,6 +56,7 @@ class FrictionSet(CollisionSet):
             neighbours = self._upload(shapes.beside(candidates.first.size))
         self.directions = neighbours, coefficients
         self.angles = [self._upload(each) if self.rolls else None for each in angles]
+        self._body_rotations = wp.array(rotations.astype(np.int32), dtype=int, device=self.device)
         self.kernels += [self._lag, self._evaluate]
         self._onward = 0
         self._kept = ("count", "starts", "partners")
@@ -77,6 +79,9 @@ class FrictionSet(CollisionSet):
         self.lagged.spinning = wp.zeros(spinning, dtype=int, device=self.device)
         self.lagged.arm = wp.zeros(spinning, dtype=vector, device=self.device)
         self.lagged.lever = device_arrays.allocate((ANGLES, capacity if self.rolls else 0), vector, self.device)
+        rotating, radii = capacity if self.rotates else 0, wp.types.vector(BODIES, self.real)
+        self.lagged.normal = wp.zeros(rotating, dtype=vector, device=self.device)
+        self.lagged.radii = wp.zeros(rotating, dtype=radii, device=self.device)
 
     def lag(self, law, x: wp.array, again: bool, more: wp.array) -> None:
         """Copy the active contact pairs as evaluated last, at x; `again`: within a solve, with the directions of slips.
@@ -94,6 +99,7 @@ class FrictionSet(CollisionSet):
             *self.directions,
             self._spins.places,
             *self.angles,
+            self._body_rotations,
         ]
         inputs += [contact.factor, contact.gradient, self._onward, more, self.count]
         outputs = [self.pairs, self.factor, self.lagged, self._slip, self._along]

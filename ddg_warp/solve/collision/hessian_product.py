@@ -23,9 +23,8 @@ class PairProduct:
         self._parts, self._real, self._linear, self._device = pair_sets, real, linear, pair_sets[0].device
         types = int, wp.types.vector(3, real)
         self._nothing = [wp.zeros(0, dtype=dtype, device=self._device) for dtype in types]
-        made = product_kernels(
-            real, linear, device_arrays.serial(self._device), any(pair_set.rolls for pair_set in pair_sets)
-        )
+        rolls, rotates = (any(getattr(each, name) for each in pair_sets) for name in ("rolls", "rotates"))
+        made = product_kernels(real, linear, device_arrays.serial(self._device), rolls, rotates)
         self._multiply, self._gather, self._meet, self._settle = made
         self.kernels = [*made]
         self.kernels += [kernel for pair_set in self._mollified for kernel in pair_set.kernels]
@@ -70,10 +69,10 @@ class PairProduct:
 
     def _set(self, pair_set):
         struct, kind = set_struct(self._real, self._linear)(), pair_set.found.kind
-        for name in ("nodes", "used", "row", "bend", "angles", "lever"):
+        for name in ("nodes", "used", "row", "bend", "angles", "lever", "rotations", "radii", "spin"):
             setattr(struct, name, getattr(pair_set.factor, name))
-        names = ("pairs", "count", "gradient", "placed", "places", "numbers", "items", "ranks", "angle_ranks", "idle")
-        for name in names:
+        names = ("pairs", "count", "gradient", "placed", "places", "numbers", "items", "idle")
+        for name in (*names, "ranks", "angle_ranks", "rotation_ranks"):
             setattr(struct, name, getattr(pair_set, name))
         for name in ("marks", "starts", "columns") if pair_set.mollified and pair_set.mollified.keeps else ():
             setattr(struct, name, getattr(pair_set.mollified, name))

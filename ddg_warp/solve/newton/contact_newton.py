@@ -94,14 +94,16 @@ class NewtonContact:
         self.search.update(x)
 
     @timer("friction lag")
-    def lag(self, x: wp.array, again: bool = False, rate: wp.array | None = None) -> None:
+    def lag(self, x: wp.array, again: bool = False, rate: wp.array | None = None, rotation=None) -> None:
         """Update the friction lag (normal forces, tangents) at positions x, which belong to the motion that was limited last.
 
         Slips restart, unless the update is made `again` within a step. At the start of a step, `rate` is the previous step's; see
-        `ContactPotential.lag`.
+        `ContactPotential.lag`. Orientations `rotation` of rigid bodies (W B,) are where slips start.
         """
         if self.has_friction:
             self.terms.lag(x, again, rate)
+            if self.rigid_bodies and not again:
+                self.rigid_bodies.begin_slip(rotation, self.terms.start)
 
     def lag_again(self, solution: wp.array, iterates, islands) -> None:
         """Update the friction lag at the iterate of converged worlds, and keep that in one of `solutions`."""

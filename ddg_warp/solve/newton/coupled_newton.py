@@ -346,7 +346,8 @@ class CoupledNewton:
         contact = partial(self.contact.assemble, self.iterates, self.islands)
         device_arrays.side_by_side([self._assemble_elements, contact], self.coupled.device)
         if self.rigid_bodies:
-            self.rigid_bodies.condense_contact(self.contact.hessian.diagonal)
+            hessian = self.contact.hessian
+            self.rigid_bodies.condense_contact(hessian.products.sets, hessian.diagonal)
         self.contact.hessian.add_to_bands(self.islands.arrays[0])
 
     def _assemble_elements(self) -> None:

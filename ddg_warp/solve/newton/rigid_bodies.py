@@ -46,6 +46,7 @@ class RigidBodies:
             wp.zeros(n, dtype=real, device=device) for n in (worlds * coupled.blocks, worlds)
         )
         self._measure, self._shorten, self._note = motion.arc_kernels(real)
+        self._turn = motion.turn_kernel(real)
         self._place, self._spread = motion.place_kernel(real), motion.spread_kernel(real, linear)
         self._balance = condensation.balance_kernel(real, linear, quadratic, outer)
         M = wp.types.matrix((3, 3), linear)
@@ -58,7 +59,7 @@ class RigidBodies:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        contact = [self._gather, self._condense_diagonal, self._condense_product]
+        contact = [self._gather, self._condense_diagonal, self._condense_product, self._turn]
         contact += [self._measure, self._shorten, self._note]
         return [
             self._place,
@@ -82,6 +83,11 @@ class RigidBodies:
         tables = self.tables
         inputs = [self.bodies.derivative, tables.owner, tables.carried, tables.origins, tables.spins]
         self._launch(self._spread, self._carried, [*inputs, self.coupled.blocks], [direction])
+
+    def begin_slip(self, rotation: wp.array, start: wp.array) -> None:
+        """Write rotation vectors from the predicted orientations to orientations (W B,) into dof blocks at the start of slip."""
+        inputs = [self.predicted, rotation, self.tables.spins, self.coupled.blocks]
+        self._launch(self._turn, len(self.tables), inputs, [start])
 
     def bound_rotations(self, start: wp.array, q: wp.array, ccd_body: wp.array, num_ccd_bodies: int, together) -> None:
         """Shorten the motions from `start` to q that rotate a body by more than `longest`.
@@ -107,9 +113,9 @@ class RigidBodies:
         inputs = [self.bodies, products.sets, products.in_pairs, p, system.masks.inactive, system.wanted]
         self._launch(self._gather, len(self.tables), inputs, [product, system.dots])
 
-    def condense_contact(self, diagonal: wp.array) -> None:
-        """Write the diagonal blocks of contact of bodies, and `cross`, from the blocks of carried nodes."""
-        inputs = [self.bodies, self.coupled.blocks]
+    def condense_contact(self, sets: wp.array, diagonal: wp.array) -> None:
+        """Write the diagonal blocks of contact of bodies, and `cross`, from the blocks of carried nodes and sets of pairs."""
+        inputs = [self.bodies, sets, self.coupled.blocks]
         self._launch(self._condense_diagonal, len(self.tables), inputs, [diagonal, self.cross])
 
     def factorise(self, system, more: wp.array) -> None:

@@ -200,7 +200,7 @@ class StepDriver:
                 newton.system,
                 self.islands,
             )  # CCD filter of the predictor
-            contact.lag(before.q, rate=before.rate)
+            contact.lag(before.q, rate=before.rate, rotation=before.rotation)
         self.solve(start)  # Newton's method
         for solution in contact.solutions if contact else ():  # further friction iterations
             contact.lag_again(solution, newton.iterates, self.islands)

@@ -1,7 +1,8 @@
 """Assembly of contact: sum the contributions of pairs to their nodes in a fixed order.
 
-An item is 6 pair + local index. Local indices 0-3 are the nodes of a pair; if friction rolls rods, 4 and 5 are twist angles of its
-edges, the x of dof blocks of their own. `incidence` lists the items of each node.
+An item is 8 pair + local index. Local indices 0-3 are the nodes of a pair; if friction rolls rods, 4 and 5 are twist angles of its
+edges, the x of dof blocks of their own. If friction acts on surfaces of rigid bodies, 6 and 7 are rotation blocks of the bodies on both
+sides. `incidence` lists the items of each node.
 """
 
 from functools import cache
@@ -12,8 +13,9 @@ from ddg_warp.kernels.collision.primitives import surface_struct
 from ddg_warp.kernels.core.launch import CPU_OPTIONS, until_function
 from ddg_warp.kernels.core.vectorised_access import read_function, write_function
 
-PAIR_NODES, ANGLES = 4, 2  # nodes of a pair, and angles
-ITEMS = PAIR_NODES + ANGLES
+PAIR_NODES, ANGLES, BODIES = 4, 2, 2  # nodes of a pair, twist angles, and rotations of rigid bodies
+FIRST_BODY = PAIR_NODES + ANGLES  # local index of the first rotation
+ITEMS = FIRST_BODY + BODIES
 ROW, WEIGHT = 8, 4  # numbers of a factor row, and index of its first weight
 PLACED = 4  # numbers of a placed contribution, of which the last is unused
 
@@ -123,8 +125,12 @@ def factor_struct(linear):
     `used` (capacity,): 0 for pairs that contribute nothing, else bit 0 is set.
     `bend` (capacity,): coefficient of the geometric stiffness, see `geometric_stiffness`, or 0.
     `angles` (capacity,): dof blocks of twist angles, negative for none; empty without rolling friction.
+    `rotations`, `radii` (capacity,): rotation blocks of the rigid bodies of both sides, negative for none, and radii of their surfaces
+        [m], else zero; empty without friction on rigid bodies.
+    `spin` (rows, capacity): entries of the row for a rotation of a surface of radius 1.
     """
     R, A = wp.types.vector(ROW, linear), wp.types.vector(ANGLES, linear)
+    V, B = wp.types.vector(3, linear), wp.types.vector(BODIES, linear)
 
     @wp.struct
     class Factor:
@@ -134,6 +140,9 @@ def factor_struct(linear):
         bend: wp.array(dtype=linear)
         angles: wp.array(dtype=wp.vec2i)
         lever: wp.array2d(dtype=A)
+        rotations: wp.array(dtype=wp.vec2i)
+        radii: wp.array(dtype=B)
+        spin: wp.array2d(dtype=V)
 
     return Factor
 
@@ -142,7 +151,7 @@ def factor_struct(linear):
 def set_struct(real, linear):
     """List of pairs with factors (see `factor_struct`), gradients, items of nodes and products.
 
-    `ranks`, `angle_ranks`: positions of the items of a pair in the list of all items, -1 for none.
+    `ranks`, `angle_ranks`, `rotation_ranks`: positions of the items of a pair in the list of all items, -1 for none.
     `placed`: contributions of products, by rank, so that nodes read consecutive entries.
     `places`, `numbers`, `items`: incidence list of the nodes.
     `marks`, `starts`, `columns`: stored Hessians, see `pair_evaluation`; empty if there are none.
@@ -154,7 +163,7 @@ def set_struct(real, linear):
     `primitives`: number of first primitives in one world.
     """
     X, V, R = wp.types.vector(3, real), wp.types.vector(3, linear), wp.types.vector(ROW, linear)
-    A, W = wp.types.vector(ANGLES, linear), wp.types.vector(PLACED, linear)
+    A, W, B = (wp.types.vector(size, linear) for size in (ANGLES, PLACED, BODIES))
 
     @wp.struct
     class PairSet:
@@ -165,6 +174,9 @@ def set_struct(real, linear):
         bend: wp.array(dtype=linear)
         angles: wp.array(dtype=wp.vec2i)
         lever: wp.array2d(dtype=A)
+        rotations: wp.array(dtype=wp.vec2i)
+        radii: wp.array(dtype=B)
+        spin: wp.array2d(dtype=V)
         gradient: wp.array2d(dtype=X)
         marks: wp.array(dtype=int)
         starts: wp.array(dtype=int)
@@ -175,6 +187,7 @@ def set_struct(real, linear):
         items: wp.array(dtype=int)
         ranks: wp.array(dtype=wp.vec4i)
         angle_ranks: wp.array(dtype=wp.vec2i)
+        rotation_ranks: wp.array(dtype=wp.vec2i)
         count: wp.array(dtype=int)
         idle: wp.array(dtype=wp.uint8)
         kind: int
@@ -216,12 +229,14 @@ def sum_kernel(real, serial: bool):
 
 
 @cache
-def collect_kernels(real, linear, serial: bool, rolls: bool):
+def collect_kernels(real, linear, serial: bool, rolls: bool, rotates: bool):
     """Build the kernels of forces and of matrix blocks along rods.
 
     `collect`: write forces of all lists and the diagonal blocks of H.
     `join`: write the blocks of H between the nodes of edges.
     `roll`: write the couplings of twist angles, if friction `rolls` rods; their diagonal blocks are with the nodes.
+
+    If friction `rotates` rigid bodies, diagonal blocks of rotations are with the nodes, too.
 
     A `serial` thread adds pair by pair, in the order in which parallel threads gather node by node.
     """
@@ -232,10 +247,15 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
     prefetch, slope_of, pair_of = prefetch_function(real, linear), read_function(V, 2), read_function(wp.vec2i)
 
     @wp.func
+    def square(v: L):
+        """Return v v^T, as six entries."""
+        return B(v[0] * v[0], v[0] * v[1], v[0] * v[2], v[1] * v[1], v[1] * v[2], v[2] * v[2])
+
+    @wp.func
     def product(row: R, a: int, b: int):
         """Return the symmetric 3 x 3 block of one Gauss-Newton row between nodes a and b [N/m], as six entries."""
-        v, w = direction_of(row), weight_of(row)
-        return B(v[0] * v[0], v[0] * v[1], v[0] * v[2], v[1] * v[1], v[1] * v[2], v[2] * v[2]) * (w[a] * w[b])
+        w = weight_of(row)
+        return square(direction_of(row)) * (w[a] * w[b])
 
     @wp.func
     def block(pair_set: PairSet, p: int, used: int, first: R, second: R, a: int, b: int):
@@ -253,7 +273,15 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
 
     @wp.func
     def block_of(pair_set: PairSet, p: int, used: int, first: R, second: R, local: int):
-        """Return the diagonal block of pair p at a node or, in xx alone, a twist angle."""
+        """Return the diagonal block of pair p at a node, at a rotation or, in xx alone, a twist angle."""
+        if wp.static(rotates):
+            if local >= wp.static(FIRST_BODY):
+                m = B()
+                radius = pair_set.radii[p][local - wp.static(FIRST_BODY)]
+                for k in range(pair_set.rows):
+                    if (used >> (k + 1)) & 1 != 0:
+                        m += square(pair_set.spin[k, p] * radius)
+                return m
         if wp.static(rolls):
             if local >= wp.static(PAIR_NODES):
                 m = B()
@@ -305,6 +333,16 @@ def collect_kernels(real, linear, serial: bool, rolls: bool):
                                     local = wp.static(PAIR_NODES) + side
                                     forces[angle] = forces[angle] - pair_set.gradient[local, p]
                                     diagonal[angle] = diagonal[angle] + whole(
+                                        block_of(pair_set, p, used, first, second, local)
+                                    )
+                    if wp.static(rotates):
+                        if pair_set.rotations.shape[0] > 0:
+                            for side in range(wp.static(BODIES)):
+                                node = pair_set.rotations[p][side]
+                                if node >= 0:
+                                    local = wp.static(FIRST_BODY) + side
+                                    forces[node] = forces[node] - pair_set.gradient[local, p]
+                                    diagonal[node] = diagonal[node] + whole(
                                         block_of(pair_set, p, used, first, second, local)
                                     )
         for node in range(forces.shape[0]):

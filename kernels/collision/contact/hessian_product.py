@@ -6,6 +6,7 @@ import warp as wp
 
 from ddg_warp.kernels.collision.contact.assembly import (
     ANGLES,
+    BODIES,
     PAIR_NODES,
     place_functions,
     prefetch_function,
@@ -40,7 +41,7 @@ def total_function(real, linear):
 
 
 @cache
-def product_kernels(real, linear, serial: bool, rolls: bool):
+def product_kernels(real, linear, serial: bool, rolls: bool, rotates: bool):
     """Build the kernels of the product.
 
     `multiply`: write the product of each pair.
@@ -97,6 +98,23 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
             for side in range(wp.static(ANGLES)):
                 store(pair_set.placed, pair_set.angle_ranks[p][side], V(t[side], linear(0.0), linear(0.0)))
 
+    @wp.func
+    def rotation_of(pair_set: PairSet, p: int, v: wp.array(dtype=V)):
+        """Return the sum of the values at the rotations of a pair, times the radii."""
+        total = V()
+        if pair_set.rotations.shape[0] > 0:
+            for side in range(wp.static(BODIES)):
+                if pair_set.rotations[p][side] >= 0:
+                    total += v[pair_set.rotations[p][side]] * pair_set.radii[p][side]
+        return total
+
+    @wp.func
+    def store_rotations(pair_set: PairSet, p: int, value: V):
+        """Store the contributions of a pair to rotations."""
+        if pair_set.rotations.shape[0] > 0:
+            for side in range(wp.static(BODIES)):
+                store(pair_set.placed, pair_set.rotation_ranks[p][side], value * pair_set.radii[p][side])
+
     @wp.kernel(
         module="unique", enable_backward=False, grid_stride=False, launch_bounds=TWO_BLOCKS, module_options=CPU_OPTIONS
     )
@@ -132,9 +150,11 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
                             )
                             store(pair_set.placed, ranks[local], value)
                         continue
-                    y, t, z = Y(), A(), A()
+                    y, t, z, rotation, couple = Y(), A(), A(), V(), V()
                     if wp.static(rolls):
                         t = angles_of(pair_set, p, v)
+                    if wp.static(rotates):
+                        rotation = rotation_of(pair_set, p, v)
                     for k in range(pair_set.rows):
                         if (used >> (k + 1)) & 1 != 0:
                             entry = first
@@ -147,10 +167,18 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
                             if wp.static(rolls):
                                 if pair_set.angles.shape[0] > 0:
                                     moved += wp.dot(pair_set.lever[k, p], t)
+                            if wp.static(rotates):
+                                if pair_set.rotations.shape[0] > 0:
+                                    moved += wp.dot(pair_set.spin[k, p], rotation)
+                                    couple += pair_set.spin[k, p] * moved
+                            if wp.static(rolls):
+                                if pair_set.angles.shape[0] > 0:
                                     z += pair_set.lever[k, p] * moved
                             y += wp.outer(w, along * moved)
                     if wp.static(rolls):
                         store_angles(pair_set, p, z)
+                    if wp.static(rotates):
+                        store_rotations(pair_set, p, couple)
                     if wanted.shape[0] > 0 and pair_set.kind >= 0:
                         c = pair_set.bend[p]
                         if c != linear(0.0) and wanted[pair_set.pairs[p][0] / pair_set.primitives] != 0:
@@ -166,6 +194,8 @@ def product_kernels(real, linear, serial: bool, rolls: bool):
                         store(pair_set.placed, ranks[local], V())
                     if wp.static(rolls):
                         store_angles(pair_set, p, A())
+                    if wp.static(rotates):
+                        store_rotations(pair_set, p, V())
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def gather(sets: wp.array(dtype=PairSet), out: wp.array(dtype=V)):

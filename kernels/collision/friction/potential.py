@@ -15,9 +15,10 @@ with forces f_i = -w_i f, f = (t1, t2) psi'(u) at most mu N. Forces have no resu
 pressure, their moment is that of -f at r, since friction acts on centrelines and midsurfaces. Weights are large where the forces of a
 pair on one side nearly cancel; still |f_i| <= mu |g_i . n|.
 
-Round obstacles rotate while their nodes stay. A rotation phi of a radius R (`kernels.collision.friction.surface_rotation`) adds phi
-x R n to the slip, on either side, and receives the couple -R n x f. For a rolling rod of radius R, the edge with direction d adds R
-d x n times the change of its twist angle.
+Surfaces of radius R about nodes may rotate. On either side a rotation phi adds phi x R n to the slip, and receives the couple
+-R n x f. Obstacles rotate while their nodes stay (`kernels.collision.friction.surface_rotation`). A rolling rod rotates about its edge
+with the direction d, by the change of the twist angle. For a rigid body phi is the change of its rotation vector about the predicted
+flight (`kernels.rigid_bodies.motion`): balls, capsules and rounded edges roll.
 
 Rods on obstacles may have anisotropic coefficients: forwards, backwards and across (`directed`). Then mu is the smallest nonzero one.
 t1 lies along the rod, and the lengths of t1 and t2 are their coefficients over mu, t1 by the sense of the slip. So psi is convex with a
@@ -40,10 +41,17 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.collision.contact.assembly import ANGLES, PAIR_NODES, factor_struct, lay_functions
+from ddg_warp.kernels.collision.contact.assembly import (
+    ANGLES,
+    BODIES,
+    FIRST_BODY,
+    PAIR_NODES,
+    factor_struct,
+    lay_functions,
+)
 from ddg_warp.kernels.collision.contact.closest_points import tangents_function
 from ddg_warp.kernels.collision.contact.pair_evaluation import groups_function, law_struct
-from ddg_warp.kernels.collision.primitives import EDGES, Kind, sides_struct
+from ddg_warp.kernels.collision.primitives import EDGES, Kind, sides_struct, surface_struct
 from ddg_warp.kernels.core.division import nonzero_function
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.densities import Density
@@ -59,8 +67,9 @@ def lagged_struct(real):
     is the first tangent of backward slip. spinning: index of the spinning object (`kernels.collision.friction.surface_rotation`)
         over all worlds, negative
     for none. arm: its radius along the normal [m]. lever: slip by the angles of rolling rods (2, capacity) [m].
+    normal, radii: n, and the radii [m] of both surfaces of rigid bodies, else zero.
     """
-    V, W = wp.types.vector(3, real), wp.types.vector(PAIR_NODES, real)
+    V, W, B = wp.types.vector(3, real), wp.types.vector(PAIR_NODES, real), wp.types.vector(BODIES, real)
 
     @wp.struct
     class Lagged:
@@ -70,6 +79,8 @@ def lagged_struct(real):
         spinning: wp.array(dtype=int)
         arm: wp.array(dtype=V)
         lever: wp.array2d(dtype=V)
+        normal: wp.array(dtype=V)
+        radii: wp.array(dtype=B)
 
     return Lagged
 
@@ -173,21 +184,31 @@ def directed_basis(real):
 
 
 @cache
-def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: bool):
+def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: bool, rotates: bool):
     """Build the kernel that lags friction of pairs, from factors and gradients of contact.
 
     x: lagged positions. rod_nodes (primitives,): the two nodes that give the direction of the rod of a first primitive of one world.
     multipliers: by groups, coefficients forwards, backwards and across over `friction`. Directed friction reads all three.
     spinning (objects,): blocks of the markers of an object, negative without. It is read if objects spin.
     more (worlds,): addition to normal forces [N].
-    first_angles, second_angles (primitives,): see `CollisionMesh.angles`; read if rods roll, like x and rod_nodes.
+    first_angles, second_angles (primitives,): see `CollisionMesh.angles`. These are read if rods roll, like x and rod_nodes.
+    body_rotations (objects,): rotation blocks of rigid bodies, negative for others. It is read if friction `rotates` bodies.
     """
     Law, Sides, Factor, Lagged = law_struct(real), sides_struct(real), factor_struct(linear), lagged_struct(real)
     V, W, (_, weigh) = wp.types.vector(3, real), wp.types.vector(PAIR_NODES, real), lay_functions(real, linear)
-    E = wp.types.vector(2, real)
+    E, B, L = wp.types.vector(2, real), wp.types.vector(BODIES, real), wp.types.vector(BODIES, linear)
     tangents, groups, size = tangents_function(real), groups_function(real), kind.first + kind.second
     along_rod, spun = directed_basis(real), spun_function(real)
     angles_of, radii, levers = rolling_functions(kind, real)
+    Surface = surface_struct(real)
+
+    @wp.func
+    def rotating(surface: Surface, body_rotations: wp.array(dtype=int), w: int, number: int):
+        """Return the rotation block and the radius of an object, -1 and zero for all but surfaces of rigid bodies."""
+        block = body_rotations[number]
+        if block < 0:
+            return -1, real(0.0)
+        return block + w * surface.nodes_a_world, surface.radius[w, number]
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def lag(
@@ -202,6 +223,7 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: boo
         spinning: wp.array(dtype=wp.vec4i),
         first_angles: wp.array(dtype=wp.vec2i),
         second_angles: wp.array(dtype=wp.vec2i),
+        body_rotations: wp.array(dtype=int),
         contact: Factor,
         gradient: wp.array2d(dtype=V),
         continued: int,
@@ -228,6 +250,12 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: boo
             mu = law.friction[w, a, b]
             if wp.static(rolls):
                 factor.angles[p] = angles_of(first_angles, second_angles, i, j, w * sides.first.nodes_a_world)
+            if wp.static(rotates):
+                body_one, r_one = rotating(sides.first, body_rotations, w, sides.first.object[i])
+                body_two, r_two = rotating(sides.second, body_rotations, w, sides.second.object[j])
+                factor.rotations[p] = wp.vec2i(body_one, body_two)
+                factor.radii[p] = L(linear(r_one), linear(r_two))
+                lagged.radii[p] = B(r_one, r_two)
             push = V()
             for slot in range(wp.static(kind.first)):
                 push += gradient[slot, p]
@@ -255,6 +283,8 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: boo
                     spinning_object, radius = spun(sides, spinning, w, i, j)
                     lagged.spinning[p] = spinning_object
                     lagged.arm[p] = n * radius
+                if wp.static(rotates):
+                    lagged.normal[p] = n
                 lagged.bound[p] = mu * (normal + more[w])
                 lagged.weight[p] = weight
                 lagged.tangent[0, p] = t1
@@ -266,7 +296,7 @@ def lag_kernel(kind: Kind, real, linear, directed: bool, spins: bool, rolls: boo
 
 
 @cache
-def friction_kernel(density: Density, real, linear, directed: bool, spins: bool, rolls: bool):
+def friction_kernel(density: Density, real, linear, directed: bool, spins: bool, rolls: bool, rotates: bool):
     """Build the kernel of energy, work, gradient by local node index and factor of each pair at x, by the slip since `start`.
 
     first_count: first primitives of one world. velocity: nu [m/s]. rate (worlds,): 1/h [1/s]. accepted, iteration (worlds,): row of
@@ -276,6 +306,7 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
     Factor, Lagged = factor_struct(linear), lagged_struct(real)
     V, (aim, _) = wp.types.vector(3, real), lay_functions(real, linear)
     E, M, A = wp.types.vector(2, real), wp.types.matrix((2, 2), real), wp.types.vector(ANGLES, linear)
+    S = wp.types.vector(3, linear)
     P = wp.types.vector(density.parameter_size(2), real)
     energy_of, slope_of, curvature_of = density.laws(real, 2)
     one, half = wp.constant(real(1.0)), wp.constant(real(0.5))
@@ -351,6 +382,11 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
                         angle = factor.angles[p][side]
                         if angle >= 0:
                             move += lagged.lever[side, p] * (x[angle][0] - start[angle][0])
+                if wp.static(rotates):
+                    for side in range(wp.static(BODIES)):
+                        body = factor.rotations[p][side]
+                        if body >= 0:
+                            move += wp.cross(x[body] - start[body], lagged.normal[p]) * lagged.radii[p][side]
                 forward_row = int(0)
                 if wp.static(directed):
                     if wp.dot(lagged.tangent[0, p] + lagged.tangent[2, p], move) < real(0.0):
@@ -367,6 +403,10 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
                     for side in range(wp.static(ANGLES)):
                         couple = wp.dot(lagged.lever[side, p], t1 * f[0] + t2 * f[1])
                         gradient[wp.static(PAIR_NODES) + side, p] = V(couple, real(0.0), real(0.0))
+                if wp.static(rotates):
+                    moment = wp.cross(lagged.normal[p], t1 * f[0] + t2 * f[1])
+                    for side in range(wp.static(BODIES)):
+                        gradient[wp.static(FIRST_BODY) + side, p] = moment * lagged.radii[p][side]
                 w = f / bound
                 if accepted.shape[0] > 0:
                     old = accepted[world]
@@ -389,6 +429,9 @@ def friction_kernel(density: Density, real, linear, directed: bool, spins: bool,
                         if wp.static(rolls):
                             one, two = wp.dot(lagged.lever[0, p], v), wp.dot(lagged.lever[1, p], v)
                             factor.lever[k, p] = A(linear(one), linear(two))
+                        if wp.static(rotates):
+                            spin = wp.cross(lagged.normal[p], v)
+                            factor.spin[k, p] = S(linear(spin[0]), linear(spin[1]), linear(spin[2]))
             factor.used[p] = used
 
     return evaluate
