@@ -10,7 +10,7 @@ import numpy as np
 
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
-from ddg_warp.typing import Floats, Integers, Numbers
+from ddg_warp.typing import Bools, Floats, Integers, Numbers
 
 Mesh: TypeAlias = tuple[Floats, Integers]
 
@@ -242,6 +242,12 @@ def weld(points: Numbers, triangles: Numbers, tolerance: float) -> Mesh:
     Raises:
         SceneError: no positive tolerance, or one that leaves no triangle.
     """
+    kept, numbers, remaining = merge(points, triangles, tolerance)
+    return np.asarray(points, float)[kept], numbers[np.asarray(triangles)[remaining]]
+
+
+def merge(points: Numbers, triangles: Numbers, tolerance: float) -> tuple[Integers, Integers, Bools]:
+    """Return (vertices that `weld` keeps (p,), new index of each vertex (P,), triangles that remain (T,) bool)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
@@ -260,12 +266,13 @@ def weld(points: Numbers, triangles: Numbers, tolerance: float) -> Mesh:
     count, group = connected_components(graph, directed=False)
     first = np.full(count, len(points))
     np.minimum.at(first, group, np.arange(len(points)))
-    kept, new_index = np.unique(first[group], return_inverse=True)  # the first vertex of each group gives its position
-    triangles = new_index.reshape(-1)[triangles]
-    triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
-    if not len(triangles):
+    kept, numbers = np.unique(first[group], return_inverse=True)  # the first vertex of each group gives its position
+    numbers = numbers.reshape(-1)
+    welded = numbers[triangles]
+    remaining = (welded != np.roll(welded, 1, axis=1)).all(axis=1)
+    if not remaining.any():
         raise SceneError(f"weld: a tolerance of {tolerance} m leaves no triangle; give less than the lengths of edges")
-    return points[kept], triangles
+    return kept, numbers, remaining
 
 
 def _check_counts(**counts: int) -> None:

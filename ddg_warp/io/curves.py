@@ -23,6 +23,7 @@ class CurveSet:
             edge has the mean of its ends.
         path: Location of the curves in the file: a USD prim path, an HDF5 dataset, a section.
         attributes: Further values of each rod by name, shape (R,), such as ids and groups of a groom; a `Recorder` stores them.
+        unread: Contents of the file that were not read, one text each.
     """
 
     points: Floats
@@ -31,6 +32,7 @@ class CurveSet:
     radius: Floats | None
     path: str
     attributes: dict[str, Array] = field(default_factory=dict)
+    unread: tuple[str, ...] = ()
 
     @property
     def names(self) -> Names:

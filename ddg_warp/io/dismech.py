@@ -1,12 +1,14 @@
-"""Reader of rods in text files of the DisMech family (MATLAB, Python: sections; C++: bare coordinates).
+"""Readers of rods and shells in text files of the DisMech family (MATLAB, Python: sections; C++: bare coordinates).
 
     *Nodes               one `x, y, z` a line, metres (also `*rodNodes`)
     0.0, 0.0, 0.0
     ...
     *Edges               one `i, j` a line (also `*rodEdges`), counted from 1
     1, 2
+    *Triangles           one `i, j, k` a line (also `*shellTriangles`), counted from 1
+    1, 2, 3
 
-The MATLAB and Python programs count nodes from 1. A file in which an edge names node 0 is taken to count from 0.
+The MATLAB and Python programs count nodes from 1. A file in which an edge or a triangle names node 0 is taken to count from 0.
 The C++ program has no sections: its files hold one node a line, separated by blanks, in order along a single rod.
 Sections that the programs derive from edges (`*elStretchRod`, ...) are skipped. Separators are commas or blanks.
 Text after `#` or `%` is a comment, in any encoding.
@@ -14,10 +16,13 @@ Text after `#` or `%` is a comment, in any encoding.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ddg_warp.io.curves import CurveSet, checked_curves
-from ddg_warp.io.paths import CurveError, existing, shown
+from ddg_warp.io.file_mesh import FileMesh, mesh_of_polygons
+from ddg_warp.io.paths import CurveError, MeshError, existing, shown
 
 COLUMNS = {"nodes": (3, float), "edges": (2, int), "triangles": (3, int)}
 ALIASES = {"rodnodes": "nodes", "rodedges": "edges", "shelltriangles": "triangles"}
@@ -28,23 +33,56 @@ DERIVED_PREFIX = "el"
 def read_rods(path) -> CurveSet:
     """Return the rods of a DisMech text file, in which edges form separate paths and cycles.
 
-    Nodes are returned in the order in which the edges run through them. The format stores no radius.
+    Nodes are returned in the order in which the edges run through them. The format stores no radius. Triangles, and nodes that
+    only triangles use, are listed as unread; `read_mesh` reads them.
     """
     path = existing(path)
     sections = _sections(path)
     nodes = np.array(sections["nodes"], dtype=np.float64).reshape(-1, 3)
     if not len(nodes):
         raise CurveError(f"{path}: there are no nodes; write one `x, y, z` a line below `*Nodes`")
-    if sections["triangles"]:
-        raise CurveError(f"{path}: the file holds a shell (`*Triangles`), which cannot be read as rods; remove them")
+    triangles = np.array(sections["triangles"], int).reshape(-1, 3)
+    if len(triangles) and not sections["edges"]:
+        raise CurveError(f"{path}: the file holds a shell (`*Triangles`) and no rods (`*Edges`); read it by read_mesh")
     edges, base = _edges(sections, len(nodes), path)
     neighbours = _neighbours(edges, len(nodes))
+    of_shell = np.isin(np.arange(len(nodes)) + base, triangles)
     for node, adjacent in enumerate(neighbours):
-        _refuse_joint(f"{path}: node {node + base}", adjacent)
-    paths = _polylines(neighbours)
+        if adjacent or not of_shell[node]:
+            _refuse_joint(f"{path}: node {node + base}", adjacent)
+    paths = [each for each in _polylines(neighbours) if len(each[0]) > 1]
     order = np.concatenate([nodes_in_order for nodes_in_order, _ in paths])
     counts, closed = [len(nodes_in_order) for nodes_in_order, _ in paths], [closed for _, closed in paths]
-    return checked_curves(nodes[order], counts, closed, None, "Nodes", str(path))
+    curves = checked_curves(nodes[order], counts, closed, None, "Nodes", str(path))
+    if not len(triangles):
+        return curves
+    shared = np.count_nonzero(of_shell[order])
+    text = f"{len(triangles)} triangles of a shell, to which {shared} nodes of rods belong; read_mesh reads them"
+    return replace(curves, unread=(text,))
+
+
+def read_shell(path) -> FileMesh:
+    """Return the triangles of a DisMech text file as a mesh, in metres; edges of rods are listed as unread.
+
+    Raises:
+        MeshError: The file has no triangles, or cannot be read; names the line.
+    """
+    try:
+        sections = _sections(path)
+    except CurveError as error:
+        raise MeshError(str(error)) from error
+    if not sections["triangles"]:
+        raise MeshError(f"{path}: there is not a single face; write one `i, j, k` a line below `*Triangles`")
+    nodes = np.array(sections["nodes"], dtype=np.float64).reshape(-1, 3)
+    triangles = np.array(sections["triangles"], dtype=int)
+    lost = [f"{len(sections['edges'])} edges of rods"] * bool(sections["edges"])
+    counts = np.full(len(triangles), 3)
+    return mesh_of_polygons(nodes, counts, triangles.ravel() - _first(sections), str(path), path.stem, lost=lost)
+
+
+def _first(sections: dict[str, list[tuple]]) -> int:
+    """Return the number of the first node, 0 or 1."""
+    return 0 if any(0 in row for name in ("edges", "triangles") for row in sections[name]) else 1
 
 
 def _sections(path) -> dict[str, list[tuple]]:
@@ -67,7 +105,7 @@ def _section(header: str, where: str) -> str:
     name = ALIASES.get(name, name)
     if name not in COLUMNS and not name.startswith(DERIVED_PREFIX):
         raise CurveError(
-            f"{where}: unknown section `{shown([header])}`; known are *Nodes, *Edges, *rodNodes, *rodEdges"
+            f"{where}: unknown section `{shown([header])}`; known are *Nodes, *Edges, *Triangles, *rodNodes, *rodEdges, *shellTriangles"
         )
     return name
 
@@ -95,7 +133,7 @@ def _edges(sections: dict[str, list[tuple]], node_count: int, path) -> tuple[np.
     if not sections["edges"]:
         raise CurveError(f"{path}: there are no edges; write one `i, j` a line below `*Edges`")
     edges = np.array(sections["edges"], dtype=int)
-    base = 0 if (edges == 0).any() else 1
+    base = _first(sections)
     out_of_range = np.flatnonzero(((edges < base) | (edges >= node_count + base)).any(axis=1))
     if len(out_of_range):
         i, j = edges[out_of_range[0]]

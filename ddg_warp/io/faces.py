@@ -55,6 +55,14 @@ def triangulated(
     return triangles, face
 
 
+def corners_of(triangles: np.ndarray, face: np.ndarray, counts: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Return the corner among `indices` at each corner of triangles, shape (T, 3); see `triangulated`."""
+    beyond = indices.max() + 1
+    keys = np.repeat(np.arange(len(counts)), counts) * beyond + indices
+    order = np.argsort(keys, kind="stable")
+    return order[np.searchsorted(keys, face[:, None] * beyond + triangles, sorter=order)]
+
+
 def fans_suit(corners: np.ndarray) -> np.ndarray:
     """Return (F,) bool: True for faces (F, n, 3) that fans from the first corner triangulate well."""
     steps = np.diff(corners, axis=1)[:, 1:], (corners[:, 1:] - corners[:, :1])[:, :-1]

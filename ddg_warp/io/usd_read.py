@@ -22,8 +22,10 @@ from ddg_warp import argument_checks
 from ddg_warp.errors import SceneWarning
 from ddg_warp.io import cubic
 from ddg_warp.io.curves import CurveSet, checked_curves
-from ddg_warp.io.faces import triangulated
+from ddg_warp.io.faces import corners_of, triangulated
+from ddg_warp.io.file_mesh import FileMesh
 from ddg_warp.io.paths import CurveError, MeshError, existing
+from ddg_warp.io.usd_texture import corner_texture, unread_of_mesh
 
 Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 LISTED = 5  # prims in a message
@@ -64,8 +66,8 @@ def read_curves(path, prim: str | None = None, samples: int = 1, outside: bool =
         return [_read_prim(each, path, samples) for each in curves]
 
 
-def read_mesh_prim(path, prim: str | None = None, outside: bool = False) -> tuple[np.ndarray, np.ndarray, str]:
-    """Return the mesh of a USD file, in metres with z up: (points (P, 3), triangles (T, 3), name of the prim).
+def read_mesh_prim(path, prim: str | None = None, outside: bool = False) -> FileMesh:
+    """Return the mesh of a USD file, in metres with z up, named as the prim, with texture coordinates (`primvars:st`).
 
     Polygons are cut by `triangulated`; holes are left out. A subdivision surface is read as its control mesh. Triangles run
     counter-clockwise seen from outside, also for leftHanded meshes and mirroring transforms.
@@ -94,12 +96,16 @@ def read_mesh_prim(path, prim: str | None = None, outside: bool = False) -> tupl
         indices = _whole(mesh.GetFaceVertexIndicesAttr(), time)
         holes = _whole(mesh.GetHoleIndicesAttr(), time)
         triangles, face = triangulated(points, counts, indices, where)
-        triangles = triangles[~np.isin(face, holes)]
+        solid = ~np.isin(face, holes)
+        triangles, corners = triangles[solid], corners_of(triangles, face, counts, indices)[solid]
+        texture, unread = corner_texture(mesh, time, indices)
         to_world, _ = _placement(mesh, time, where, MeshError)
         left_handed = mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
         if left_handed != (np.linalg.det(to_world[:3, :3]) < 0.0):
-            triangles = triangles[:, [0, 2, 1]]
-        return points @ to_world[:3, :3] + to_world[3, :3], triangles, mesh.GetPrim().GetName()
+            triangles, corners = triangles[:, [0, 2, 1]], corners[:, [0, 2, 1]]
+        points = points @ to_world[:3, :3] + to_world[3, :3]
+        uv, name = None if texture is None else texture[corners], mesh.GetPrim().GetName()
+        return FileMesh(points, triangles, name, uv=uv, unread=unread + unread_of_mesh(mesh, holes))
 
 
 @contextmanager

@@ -4,6 +4,7 @@
 import contextlib
 import io
 import tempfile
+from importlib.util import find_spec
 from pathlib import Path
 
 from bad_inputs import DEVICE, INF, NAN, clamped, each, model, refuse
@@ -51,9 +52,30 @@ def file(name: str, text: str, reader, **options):
 
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n"
+FOLD = '{{"vertices_coords": [[0, 0], [1, 0], [0, 1]], "faces_vertices": [[0, 1, 2]], "edges_vertices": [{}], "edges_foldAngle": [{}]}}'
+BEAM = "*NODE\n1,0.,0.,0.\n2,1.,0.,0.\n*ELEMENT,TYPE=B31\n1,1,2\n"
+USD_TRIANGLE = """#usda 1.0
+def Mesh "m" {
+    point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
+    int[] faceVertexCounts = [3]
+    int[] faceVertexIndices = [0, 1, 2]
+}
+"""
 refuse("meshes read", {
     "no file": (lambda: read_mesh("nowhere.obj"), "nowhere.obj", "no such file"),
-    "another format": (lambda: file("a.stl", "solid", read_mesh), "a.stl", ".obj"),
+    "another format": (lambda: file("a.3dm", "solid", read_mesh), "a.3dm", ".obj", ".stl"),
+    "an INP with another file": (lambda: file("a.inp", "*INCLUDE,INPUT=/etc/hosts\n", read_mesh), "a.inp", "*INCLUDE", "join"),
+    "an OFF without header": (lambda: file("a.off", "3 1 0\n", read_mesh), "a.off", "begin with OFF"),
+    "an OFF cut short": (lambda: file("a.off", "OFF\n3 1 0\n0 0 0\n", read_mesh), "a.off", "3 vertices and 1 faces", "1 lines follow"),
+    "a vertex of an OFF": (lambda: file("a.off", "OFF\n3 1 0\n0 0 0\n1 0\n0 1 0\n3 0 1 2\n", read_mesh), "a.off:4", "3 float"),
+    "a face of an OFF": (lambda: file("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", read_mesh), "a.off:6", "does not exist"),
+    "a FOLD of text": (lambda: file("a.fold", "solid", read_mesh), "a.fold", "no FOLD file"),
+    "a FOLD without faces": (lambda: file("a.fold", '{"vertices_coords": [[0, 0]]}', read_mesh), "a.fold", "faces_vertices"),
+    "a FOLD of a list": (lambda: file("a.fold", "[]", read_mesh), "a.fold", "list"),
+    "a crease of a FOLD": (lambda: file("a.fold", FOLD.format("[0, 9]", 0), read_mesh), "a.fold", "edge 0", "does not exist"),
+    "an angle of a FOLD": (lambda: file("a.fold", FOLD.format("[0, 1]", 270), read_mesh), "a.fold", "edge 0", "270", "-180 to 180"),
+    "a DisMech file without triangles": (lambda: file("a.txt", "*Nodes\n0,0,0\n", read_mesh), "a.txt", "*Triangles"),
+    "a unit of a USD": (lambda: file("a.usda", USD_TRIANGLE, read_mesh, unit=0.01), "a.usda", "unit = 0.01", "states its own"),
     "no faces": (lambda: file("a.obj", "v 0 0 0\n", read_mesh), "a.obj", "not a single face"),
     "empty": (lambda: file("a.obj", "", read_mesh), "a.obj", "not a single face"),
     "vertex of letters": (lambda: file("a.obj", "v a b c\n", read_mesh), "a.obj:1", "three numbers"),
@@ -75,6 +97,18 @@ each(
     "tolerance",
     "positive",
 )
+if find_spec("trimesh") and find_spec("meshio"):
+    refuse("meshes read", {
+        "an STL without triangles": (lambda: file("a.stl", "solid", read_mesh), "a.stl", "not a single face"),
+        "a PLY of text": (lambda: file("a.ply", "solid", read_mesh), "a.ply", "no PLY file", "export it again"),
+        "a GLB of text": (lambda: file("a.glb", "solid", read_mesh), "a.glb", "no GLB file", "export it again"),
+        "an MSH cut short": (lambda: file("a.msh", "$MeshFormat\n4.1 0 8\n", read_mesh), "a.msh", "no MSH file"),
+        "a VTU of text": (lambda: file("a.vtu", "solid", read_mesh), "a.vtu", "no VTU file"),
+        "a VTK of text": (lambda: file("a.vtk", "solid", read_mesh), "a.vtk", "no VTK file"),
+        "an INP of lines": (lambda: file("a.inp", BEAM, read_mesh), "a.inp", "line"),
+    })
+each("meshes read", "unit", [0.0, -1.0, NAN, "mm"], lambda v: file("a.obj", SQUARE, read_mesh, unit=v), "unit", "positive")
+each("meshes read", "up", ["x", "Y", 1], lambda v: file("a.obj", SQUARE, read_mesh, up=v), "up")
 refuse("rods read", {
     "no file": (lambda: read("nowhere.txt"), "nowhere.txt", "no such file"),
     "another format": (lambda: file("a.csv", "0,0,0", read), "a.csv", "DisMech"),

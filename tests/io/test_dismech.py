@@ -59,7 +59,7 @@ def test_a_file_without_sections_is_one_rod(tmp_path):
         (NODES + "*Edges\n1,2\n2,1\n3,4\n", r"node 1: an edge is listed twice"),
         (NODES, r"there are no edges"),
         (NODES + "*Springs\n1,2\n", r"rods.txt:6: unknown section `\*Springs`"),
-        (NODES + "*Triangles\n1,2,3\n*Edges\n1,2\n", r"holds a shell"),
+        (NODES + "*Triangles\n1,2,3\n*Edges\n1,2\n", r"node 4 belongs to no edge"),
         ("", r"there are no nodes"),
     ],
 )

@@ -126,9 +126,9 @@ def test_material_libraries_are_never_opened(tmp_path):
 def test_other_file_types_are_refused(tmp_path):
     with pytest.raises(MissingFileError, match="no such file"):
         read_mesh(tmp_path / "none.obj")
-    (tmp_path / "a.stl").write_text("solid")
-    with pytest.raises(MeshError, match=r"meshes are read from \.obj, \.usd"):
-        read_mesh(tmp_path / "a.stl")
+    (tmp_path / "a.3dm").write_text("solid")
+    with pytest.raises(MeshError, match=r"meshes are read from \.obj, .*\.usd"):
+        read_mesh(tmp_path / "a.3dm")
     (tmp_path / "a.obj").write_text(PYRAMID + FACES["v"])
     with pytest.raises(MeshError, match="no prims"):
         read_mesh(tmp_path / "a.obj", "/World")

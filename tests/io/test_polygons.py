@@ -7,7 +7,8 @@ from ddg_warp.geometry import polygons
 from ddg_warp.geometry.operators import face_areas
 from ddg_warp.geometry.surface import Surface
 from ddg_warp.io import MeshError
-from ddg_warp.io.mesh_read import read_mesh, triangulated
+from ddg_warp.io.faces import triangulated
+from ddg_warp.io.mesh_read import read_mesh
 
 L_SHAPE = [(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]
 ARROW = [(0, 0), (2, -1), (0.5, 0), (2, 1)]  # a concave quad
