@@ -10,10 +10,9 @@ import warnings
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneWarning
+from ddg_warp.io.axes import in_metres
 from ddg_warp.io.file_mesh import FileMesh
 from ddg_warp.io.paths import MeshError, existing
 from ddg_warp.typing import FilePath
@@ -33,7 +32,6 @@ SUFFIXES = (
     ".txt (DisMech)",
     *USD_SUFFIXES,
 )
-Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def read_mesh(
@@ -74,10 +72,10 @@ def read_mesh(
     for name, value, stated in (("unit", unit, own_unit is not None), ("up", up, own_axis)):
         if value is not None and stated:
             raise MeshError(f"{path}: {name} = {value!r}, but the file states its own; leave it out")
-    points = mesh.points * (unit or own_unit or 1.0)
+    points = in_metres(mesh.points, unit or own_unit, up)
     if mesh.lost:
         warnings.warn(f"{path}: not read: {', '.join(mesh.lost)}", SceneWarning, stacklevel=2)
-    count, mesh = len(points), mesh.changed(points @ Y_UP_TO_Z_UP.T if up == "y" else points, mesh.triangles).used()
+    count, mesh = len(points), mesh.changed(points, mesh.triangles).used()
     if len(mesh.points) < count:
         warnings.warn(f"{path}: {mesh.unread[-1]}", SceneWarning, stacklevel=2)
     return mesh if weld is None else mesh.welded(weld)

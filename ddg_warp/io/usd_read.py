@@ -21,13 +21,13 @@ from pxr import Ar, Sdf, Tf, Usd, UsdGeom
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneWarning
 from ddg_warp.io import cubic
+from ddg_warp.io.axes import Y_UP_TO_Z_UP
 from ddg_warp.io.curves import CurveSet, checked_curves
 from ddg_warp.io.faces import corners_of, triangulated
 from ddg_warp.io.file_mesh import FileMesh
 from ddg_warp.io.paths import CurveError, MeshError, existing
 from ddg_warp.io.usd_texture import corner_texture, unread_of_mesh
 
-Y_UP_TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 LISTED = 5  # prims in a message
 SHORT = 0.01  # largest relative length error of a polyline without a warning
 FINER = 4  # points of the reference polyline for lengths, over points of the polyline

@@ -111,15 +111,24 @@ each("meshes read", "unit", [0.0, -1.0, NAN, "mm"], lambda v: file("a.obj", SQUA
 each("meshes read", "up", ["x", "Y", 1], lambda v: file("a.obj", SQUARE, read_mesh, up=v), "up")
 refuse("rods read", {
     "no file": (lambda: read("nowhere.txt"), "nowhere.txt", "no such file"),
-    "another format": (lambda: file("a.csv", "0,0,0", read), "a.csv", "DisMech"),
+    "another format": (lambda: file("a.3dm", "0,0,0", read), "a.3dm", "DisMech", ".hair"),
     "no nodes": (lambda: file("a.txt", "*Nodes\n", read), "a.txt", "no nodes"),
     "a node of two": (lambda: file("a.txt", "*Nodes\n0, 0\n", read), "a.txt"),
     "a node of letters": (lambda: file("a.txt", "*Nodes\na, b, c\n", read), "a.txt"),
     "a fork": (lambda: file("a.txt", "*Nodes\n0,0,0\n1,0,0\n2,0,0\n3,0,0\n*Edges\n0,1\n0,2\n0,3\n", read), "a.txt", "node"),
     "a shell": (lambda: file("a.txt", "*Nodes\n0,0,0\n1,0,0\n1,1,0\n*Triangles\n0,1,2\n", read), "a.txt", "shell"),
     "an unknown section": (lambda: file("a.txt", "*Springs\n0,0,0\n", read), "a.txt"),
+    "a CSV without header": (lambda: file("a.csv", "0,0,0\n", read), "a.csv", "no column 'x'"),
+    "a HAIR of text": (lambda: file("a.hair", "0,0,0\n", read), "a.hair", "begin with HAIR"),
+    "a BCC of text": (lambda: file("a.bcc", "0,0,0\n", read), "a.bcc", "begin with BCC"),
+    "an MJCF without cables": (lambda: file("a.xml", "<mujoco/>", read), "a.xml", "no cables"),
+    "a unit of a USD file": (lambda: file("a.usda", "#usda 1.0\n", read, unit=0.01), "a.usda", "unit = 0.01", "state their own"),
     "USD without curves": (lambda: file("a.usda", "#usda 1.0\n", read), "a.usda", "BasisCurves"),
 })
+
+
+each("rods read", "unit", [0.0, -1.0, NAN, "mm"], lambda v: file("a.csv", "x,y,z\n0,0,0\n1,0,0\n", read, unit=v), "unit", "positive")
+each("rods read", "up", ["x", "Y", 1], lambda v: file("a.csv", "x,y,z\n0,0,0\n1,0,0\n", read, up=v), "up")
 
 
 # --- simulate ---
