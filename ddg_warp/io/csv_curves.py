@@ -42,14 +42,14 @@ def read_csv(path: Path) -> CurveSet:
     separator = max(SEPARATORS, key=lines[0][1].count)
     rows = list(csv.reader((line for _, line in lines), delimiter=separator, skipinitialspace=True))
     header = [name.strip().lower() for name in rows[0]]
-    for name in header:
-        if header.count(name) > 1:
-            raise CurveError(f"{path}: the header has two columns {name!r}; rename one of them")
     missing = [name for name in POSITION if name not in header]
     if missing:
         raise CurveError(
             f"{path}: the header {shown(rows[0])!r} has no column {missing[0]!r}; name the columns x, y, z"
         )
+    for name in header:
+        if header.count(name) > 1:
+            raise CurveError(f"{path}: the header has two columns {name!r}; rename one of them")
     strand = next((name for name in STRAND if name in header), None)
     radius = next((name for name in RADIUS if name in header), None)
     numbers, ids = np.zeros((len(rows) - 1, 4)), []

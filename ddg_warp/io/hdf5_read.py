@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import time
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields as fields_of
 from pathlib import Path
+from typing import TypeVar
 
 import h5py
 import numpy as np
@@ -17,7 +19,7 @@ from ddg_warp.io.bodies import Bodies
 from ddg_warp.io.contact_records import FIELDS as PAIR_FIELDS
 from ddg_warp.io.contact_records import Contacts, ContactScales
 from ddg_warp.io.curves import CurveSet, checked_curves
-from ddg_warp.io.journal import TrajectoryError, open_to_read
+from ddg_warp.io.journal import TrajectoryError, open_to_read, stamp
 from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.io.paths import CurveError, existing
 from ddg_warp.io.shapes import Curves, Surfaces
@@ -29,7 +31,11 @@ COUNTS = "run"  # group of a checkpoint: counts of the run up to the frame
 FRAMES = ("points", "velocities", "directors", "obstacle_points", "body_poses")
 
 
+LIVE_TIMEOUT = 5.0  # [s] of attempts to read a file between two blocks of its writer
 RATIO = 1024  # largest size of a dataset over the size of its file; only fill values compress better
+
+
+T = TypeVar("T")
 
 
 class MissingFrameError(TrajectoryError, IndexError):
@@ -60,11 +66,57 @@ def undamaged(path: Path) -> Iterator[None]:
         ) from error
 
 
+class LiveFile:
+    """HDF5 file open for reading that another process may be writing to.
+
+    A block that is written meanwhile changes metadata of the file, and HDF5 then reads a mixture of old and new. A read that fails
+    is repeated on the new content if the file has changed since it was opened.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        self._file: h5py.File | None = None
+        self._stamp: tuple = ()
+        self._closed = False
+
+    def read(self, function: Callable[[h5py.File], T]) -> T:
+        """Return the result of a function of the file.
+
+        Raises:
+            TrajectoryError: The file is damaged, or changes all the time.
+        """
+        if self._closed:
+            raise TrajectoryError(f"{self.path}: the reader is closed; read before close()")
+        end = time.monotonic() + LIVE_TIMEOUT
+        while True:
+            try:
+                with undamaged(self.path):
+                    if self._file is None:
+                        self._stamp = stamp(self.path)
+                        self._file = open_to_read(self.path)
+                    return function(self._file)
+            except (TrajectoryError, CurveError):
+                if stamp(self.path) == self._stamp or time.monotonic() > end:
+                    raise
+                self._release()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._closed = True
+        self._release()
+
+    def _release(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+
 class Frames:
     """Field of all frames, read when indexed; `shape`, `ndim` and `len` as an array."""
 
-    def __init__(self, dataset: h5py.Dataset, path: Path):
-        self._dataset, self._path = dataset, path
+    def __init__(self, file: h5py.File, name: str, live: LiveFile):
+        dataset = file[name]
+        self._name, self._live, self._path = name, live, live.path
         self.shape, self.ndim = dataset.shape, dataset.ndim
 
     def __len__(self) -> int:
@@ -73,7 +125,7 @@ class Frames:
     def __getitem__(self, frames: int | slice | Sequence[int]) -> Array:
         if isinstance(frames, int | np.integer) and not -len(self) <= frames < len(self):
             raise MissingFrameError(f"{self._path}: there is no frame {frames}; it has {len(self)}, counted from 0")
-        return rows(self._dataset, self._path, frames)
+        return self._live.read(lambda file: rows(file[self._name], self._path, frames))
 
 
 def rows(dataset: h5py.Dataset, path: Path, chosen=slice(None)) -> np.ndarray:
@@ -214,9 +266,9 @@ class NodeFrames:
 class ContactFrames:
     """`Contacts` of each frame, read when indexed by a number."""
 
-    def __init__(self, group: h5py.Group, names: list[str], path: Path):
-        self._group, self._names, self._path = group, names, path
-        self._ends = np.concatenate([[0], rows(group["ends"], path)])
+    def __init__(self, file: h5py.File, names: list[str], live: LiveFile):
+        self._names, self._live, self._path = names, live, live.path
+        self._ends = np.concatenate([[0], rows(file["trajectory/contacts/ends"], self._path)])
 
     def __len__(self) -> int:
         return len(self._ends) - 1
@@ -227,9 +279,13 @@ class ContactFrames:
                 f"{self._path}: there are no contacts of frame {frame!r}; choose one of {len(self)} by its number, from 0"
             )
         first, last = self._ends[range(len(self))[frame] :][:2]
-        with undamaged(self._path):
-            values = {name: rows(self._group[name], self._path, slice(first, last)) for name in PAIR_FIELDS}
-        return Contacts(names=self._names, **values)
+
+        def pairs(file: h5py.File) -> dict[str, np.ndarray]:
+            return {
+                name: rows(file[f"trajectory/contacts/{name}"], self._path, slice(first, last)) for name in PAIR_FIELDS
+            }
+
+        return Contacts(names=self._names, **self._live.read(pairs))
 
 
 class TrajectoryReader:
@@ -264,28 +320,27 @@ class TrajectoryReader:
 
     def __init__(self, path: FilePath, *, outside: bool = False):
         self.path = existing(path)
-        with undamaged(self.path):
-            self._file = open_to_read(self.path)
+        self._outside = argument_checks.flag("outside", outside)
+        self._live = LiveFile(self.path)
         try:
-            with undamaged(self.path):
-                if not argument_checks.flag("outside", outside):
-                    refuse_links(self._file, self.path)
-                self._read()
+            self._live.read(self._read)
         except BaseException:
-            self._file.close()
+            self._live.close()
             raise
 
-    def _read(self) -> None:
+    def _read(self, file: h5py.File) -> None:
         """Read everything but the fields of the frames."""
-        if "trajectory" not in self._file:
+        if not self._outside:
+            refuse_links(file, self.path)
+        if "trajectory" not in file:
             raise TrajectoryError(f"{self.path}: there is no group /trajectory; is it a trajectory.h5?")
-        trajectory, model = self._file["trajectory"], self._file["model"]
+        trajectory, model = file["trajectory"], file["model"]
         check_seal(model, self.path)
         self.time: Floats = rows(trajectory["time"], self.path)
         self.time_is = str(trajectory.attrs.get("time", "state"))
         self.recorded = [name for name in FRAMES if name in trajectory]
         self.recorded += [f"{kind}/{name}" for kind in ("at_points", "at_cells") for name in trajectory.get(kind, ())]
-        fields = {name: Frames(trajectory[name], self.path) for name in self.recorded}
+        fields = {name: Frames(file, f"trajectory/{name}", self._live) for name in self.recorded}
         self.points, self.velocities = fields["points"], fields.get("velocities")
         self.directors = fields.get("directors")
         self.fields = {name.rpartition("/")[2]: frames for name, frames in fields.items() if "/" in name}
@@ -309,11 +364,17 @@ class TrajectoryReader:
             names, size, force = (_array(model["touching"][name]) for name in ("names", "size", "force"))
             self.contact_scales = ContactScales(names.tolist(), float(size), float(force))
         if "contacts" in trajectory:
-            self.contacts = ContactFrames(trajectory["contacts"], self.contact_scales.names, self.path)
+            self.contacts = ContactFrames(file, self.contact_scales.names, self._live)
         _refuse_misfits(self.curves, self.surfaces, self.points.shape[-2])
         self.parameters: dict[str, Floats] = all_arrays(model["parameters"])
         self.attributes: dict[str, Array] = all_arrays(model["attributes"]) if "attributes" in model else {}
-        self.provenance: dict[str, object] = {name: _plain(value) for name, value in self._file.attrs.items()}
+        self.provenance: dict[str, object] = {name: _plain(value) for name, value in file.attrs.items()}
+        lengths = [len(values) for values in (*fields.values(), *self.series.values())]
+        if any(length != len(self.time) for length in lengths):
+            raise TrajectoryError(
+                f"{self.path}: fields have {min(lengths)} to {max(lengths)} frames and times {len(self.time)}; take a copy of "
+                "the file, or record the run again"
+            )
 
     def __enter__(self) -> TrajectoryReader:
         return self
@@ -342,38 +403,40 @@ class TrajectoryReader:
     @property
     def checkpoint_slot(self) -> str:
         """Name of the group of the last checkpoint, "a" or "b"."""
-        if "checkpoint" not in self._file:
-            raise TrajectoryError(f"{self.path}: the run ended before its first block was written; start it again")
-        with undamaged(self.path):
-            return self._file["checkpoint"].attrs["current"]
+        return self._live.read(lambda file: self._checkpoint_group(file).name.rpartition("/")[2])
 
     @property
     def checkpoint_frame(self) -> int:
         """Number of frames up to and including the checkpoint."""
-        slot = self.checkpoint_slot
-        with undamaged(self.path):
-            return int(self._file["checkpoint"][slot].attrs["frame"])
+        return self._live.read(lambda file: int(self._checkpoint_group(file).attrs["frame"]))
 
     def checkpoint(self) -> dict[str, Array]:
         """Return the last complete state, for `model.restore`."""
         frame = self.checkpoint_frame
         if frame > len(self):
             raise TrajectoryError(f"{self.path}: the checkpoint is of frame {frame}, but there are {len(self)}")
-        with undamaged(self.path):
-            group = self._file["checkpoint"][self.checkpoint_slot]
-            check_seal(group, self.path)
-            return {name: value for name, value in all_arrays(group).items() if not name.startswith(f"{COUNTS}/")}
+        arrays = self._live.read(self._checkpoint)
+        return {name: value for name, value in arrays.items() if not name.startswith(f"{COUNTS}/")}
 
     def run_counts(self) -> dict[str, Array]:
         """Return counts of the run up to the checkpoint, by name; empty if the file has none."""
-        with undamaged(self.path):
-            group = self._file["checkpoint"][self.checkpoint_slot]
-            check_seal(group, self.path)
-            return all_arrays(group[COUNTS]) if COUNTS in group else {}
+        arrays = self._live.read(self._checkpoint).items()
+        return {name.removeprefix(f"{COUNTS}/"): value for name, value in arrays if name.startswith(f"{COUNTS}/")}
+
+    def _checkpoint_group(self, file: h5py.File) -> h5py.Group:
+        if "checkpoint" not in file:
+            raise TrajectoryError(f"{self.path}: the run ended before its first block was written; start it again")
+        return file["checkpoint"][file["checkpoint"].attrs["current"]]
+
+    def _checkpoint(self, file: h5py.File) -> dict[str, Array]:
+        """Return all arrays of the last checkpoint, verified."""
+        group = self._checkpoint_group(file)
+        check_seal(group, self.path)
+        return all_arrays(group)
 
     def close(self) -> None:
         """Close the file; arrays already read stay valid."""
-        self._file.close()
+        self._live.close()
 
 
 def read_rods(path: FilePath, frame: int = -1, world: int = 0, *, outside: bool = False) -> list[CurveSet]:
@@ -392,15 +455,24 @@ def read_rods(path: FilePath, frame: int = -1, world: int = 0, *, outside: bool 
         CurveError, TrajectoryError: The file holds no rods, or no such frame or world.
     """
     path, frame, world = existing(path), argument_checks.index("frame", frame), argument_checks.index("world", world)
-    with undamaged(path), open_to_read(path) as file:
+
+    def plain(file: h5py.File) -> list[CurveSet]:
         if not outside:
             refuse_links(file, path)
-        if "points" in file:
-            if frame not in (0, -1) or world not in (0, -1):
-                raise CurveError(
-                    f"{path}: there are no frames or worlds to choose from; leave out frame = {frame}, world = {world}"
-                )
-            return [_read_plain(file, path)]
+        if "points" not in file:
+            return []
+        if frame not in (0, -1) or world not in (0, -1):
+            raise CurveError(
+                f"{path}: there are no frames or worlds to choose from; leave out frame = {frame}, world = {world}"
+            )
+        return [_read_plain(file, path)]
+
+    live = LiveFile(path)
+    try:
+        if curves := live.read(plain):
+            return curves
+    finally:
+        live.close()
     with TrajectoryReader(path, outside=outside) as reader:
         if not len(reader):
             raise CurveError(f"{path}: the trajectory has no frames; read a file of a run that wrote a block")

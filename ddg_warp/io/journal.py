@@ -266,6 +266,18 @@ def open_to_read(path) -> h5py.File:
     return h5py.File(PagedFile(path, "rb", pages, version.size), "r")
 
 
+def stamp(path) -> tuple:
+    """Return sizes, times and inodes of a file and its journal, which differ once the file has changed."""
+    stamps = []
+    for each in (Path(path), _journal_of(Path(path))):
+        try:
+            status = each.stat()
+            stamps.append((status.st_ino, status.st_size, status.st_mtime_ns))
+        except FileNotFoundError:
+            stamps.append(None)
+    return tuple(stamps)
+
+
 def recover(path) -> None:
     """Replay a complete journal onto the file, and remove the journal.
 

@@ -88,7 +88,7 @@ def test_csv_columns_are_found_by_name(tmp_path):
     [
         ("", r"a\.csv: the file is empty"),
         ("x,y\n0,0\n", "'x y' has no column 'z'"),
-        ("x,x,z\n0,0,0\n", "two columns 'x'"),
+        ("x,y,z,x\n0,0,0,0\n", "two columns 'x'"),
         ("x,y,z\n0,0,0\n1,0,a\n", r"a\.csv:3: '1 0 a' cannot be read"),
         ("x,y,z\n0,0,0\n1,0\n", r"a\.csv:3: '1 0' cannot be read; a row has 3 values"),
         ("id,x,y,z\n0,0,0,0\n0,1,0,0\n1,1,1,1\n", "curve 1 has 1 vertices, it needs 2"),

@@ -216,6 +216,31 @@ def test_complete_journals_count_as_written(tmp_path, monkeypatch):
         assert file["trajectory/time"][0] == 99.0
 
 
+def test_reads_are_repeated_if_the_writer_changed_the_file(tmp_path, monkeypatch):
+    """A read between two blocks meets metadata of both, which HDF5 reports as "addr overflow"."""
+    path, model = tmp_path / TRAJECTORY, Model()
+    state = model.state()
+    with TrajectoryWriter(path, model, block=1) as writer:
+        writer.append(state)
+        with TrajectoryReader(path) as reader:
+            writer.append(step(state))
+            failures = iter([OSError("Can't open object (addr overflow)")])
+            original = h5py.Dataset.__getitem__
+
+            def fails_once(dataset, chosen):
+                for failure in failures:
+                    raise failure
+                return original(dataset, chosen)
+
+            monkeypatch.setattr(h5py.Dataset, "__getitem__", fails_once)
+            np.testing.assert_array_equal(reader.points[0], state.points())
+            failures = iter([OSError("Can't open object (addr overflow)")])
+            with pytest.raises(TrajectoryError, match="damaged"):  # the file is the one that the read opened
+                reader.points[0]
+    with pytest.raises(TrajectoryError, match="the reader is closed"):
+        reader.points[0]
+
+
 def test_checkpoints_alternate_outside_the_journal(tmp_path, monkeypatch):
     """The journal holds only metadata, for checkpoints of any size; the old checkpoint stays until the switch."""
     journals = []
