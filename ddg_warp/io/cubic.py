@@ -42,6 +42,11 @@ class Sampled:
         """Return values at the points, shape (P, ...), from values at the vertices."""
         return np.einsum("pk,pk...->p...", self.weights, values[self.vertices])
 
+    def parameters(self) -> np.ndarray:
+        """Return the parameter of each point, the number of knots before it on its curve, shape (P,)."""
+        first = np.repeat(np.cumsum(self.knot_counts) - self.knot_counts, self.counts)
+        return self.knots[:, 0] - first + self.shares
+
     def between_knots(self, values: np.ndarray) -> np.ndarray:
         """Return values at the points, shape (P,), linear between values at the knots."""
         return (1.0 - self.shares) * values[self.knots[:, 0]] + self.shares * values[self.knots[:, 1]]
@@ -62,14 +67,28 @@ def linear(counts: np.ndarray) -> Sampled:
     return Sampled(every[:, None], np.ones((len(every), 1)), np.stack([every, every], 1), 0.0 * every, counts, counts)
 
 
-def sampled(basis: str, wrap: str, counts: np.ndarray, samples: int) -> Sampled:
+def polygons(basis: str, wrap: str, counts: np.ndarray) -> Sampled:
+    """Return the vertices of cubic curves, unchanged, with the knots that are nearest to each; see `sampled`."""
+    every, bezier = np.arange(counts.sum()), basis == "bezier"
+    knots = np.array([segments(basis, wrap, int(count)) + (wrap != PERIODIC) for count in counts])
+    position = every - np.repeat(np.cumsum(counts) - counts, counts) - (not bezier and wrap not in (PERIODIC, PINNED))
+    last = np.repeat(knots - 1, counts)
+    along = np.clip(position / (BEZIER_STEP if bezier else 1), 0.0, last + (wrap == PERIODIC))
+    before = np.minimum(np.floor(along).astype(int), last)
+    between = np.stack([before, (before + 1) % (last + 1)], 1) + np.repeat(np.cumsum(knots) - knots, counts)[:, None]
+    return Sampled(every[:, None], np.ones((len(every), 1)), between, along - before, counts, knots)
+
+
+def sampled(basis: str, wrap: str, counts: np.ndarray, samples: int | None) -> Sampled:
     """Return points of curves: the knots and `samples` - 1 points at equal parameters between neighbouring knots.
 
     Args:
         basis: One of `BASES`.
         wrap: "nonperiodic", "periodic" or "pinned".
         counts: Vertices of each curve, shape (R,), all with segments.
-        samples: Points of a segment.
+        samples: Points of a segment; None for as many points as vertices, from which the vertices follow. These are the knots, for
+            Bezier curves points at thirds of the segments, and for nonperiodic B-splines and Catmull-Rom splines one more point
+            within the first and the last segment.
     """
     local = {count: _local(basis, wrap, int(count), samples) for count in np.unique(counts)}
     each = [local[count] for count in counts]
@@ -79,13 +98,22 @@ def sampled(basis: str, wrap: str, counts: np.ndarray, samples: int) -> Sampled:
     return Sampled(vertices + before[:, None], weights, between + first[:, None], shares, points, knots)
 
 
-def _local(basis: str, wrap: str, count: int, samples: int) -> tuple:
+def _parameters(basis: str, wrap: str, number: int, samples: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return (segment, parameter from 0 to 1) of the points of one curve of `number` segments; see `sampled`."""
+    each = (BEZIER_STEP if basis == "bezier" else 1) if samples is None else samples
+    segment, parameter = np.repeat(np.arange(number), each), np.tile(np.arange(each) / each, number)
+    if wrap != PERIODIC:
+        segment, parameter = np.append(segment, number - 1), np.append(parameter, 1.0)
+    if samples is None and basis != "bezier" and wrap not in (PERIODIC, PINNED):
+        more = [1.0 / 3.0, 2.0 / 3.0] if number == 1 else [0.5, 0.5]
+        segment, parameter = np.insert(segment, [1, number], [0, number - 1]), np.insert(parameter, [1, number], more)
+    return segment, parameter
+
+
+def _local(basis: str, wrap: str, count: int, samples: int | None) -> tuple:
     """Return (vertices, weights, knots, knot weights of the points; knots) of one curve, see `Sampled`."""
     number, closed = segments(basis, wrap, count), wrap == PERIODIC
-    segment = np.repeat(np.arange(number), samples)
-    parameter = np.tile(np.arange(samples) / samples, number)
-    if not closed:
-        segment, parameter = np.append(segment, number - 1), np.append(parameter, 1.0)
+    segment, parameter = _parameters(basis, wrap, number, samples)
     step, offset = (BEZIER_STEP, 0) if basis == "bezier" else (1, 0 if wrap not in (PERIODIC, PINNED) else 1)
     vertices = np.zeros((len(segment), REACH), int)
     weights = np.zeros((len(segment), REACH))

@@ -53,7 +53,7 @@ def read_curves(path, prim: str | None = None, samples: int = 1, outside: bool =
     """
     path, samples = existing(path), argument_checks.count("read_curves: samples", samples)
     with opened(path, CurveError, outside) as stage:
-        curves, unread = _shapes(stage, path, prim, UsdGeom.BasisCurves, CurveError)
+        curves, unread = shapes_below(stage, path, prim, UsdGeom.BasisCurves, CurveError)
         unread = [each for each in unread if each.IsA(UsdGeom.Curves)]
         if not curves:
             contents = f"; it holds {_listed(unread)}" if unread else ""
@@ -82,7 +82,7 @@ def read_mesh_prim(path, prim: str | None = None, outside: bool = False) -> File
     """
     path = existing(path)
     with opened(path, MeshError, outside) as stage:
-        meshes, unread = _shapes(stage, path, prim, UsdGeom.Mesh, MeshError)
+        meshes, unread = shapes_below(stage, path, prim, UsdGeom.Mesh, MeshError)
         if len(meshes) != 1:
             contents = f"; it holds {_listed(unread)}" if unread and not meshes else ""
             listed = ", ".join(str(mesh.GetPath()) for mesh in meshes[:LISTED]) or "none"
@@ -92,14 +92,14 @@ def read_mesh_prim(path, prim: str | None = None, outside: bool = False) -> File
         (mesh,) = meshes
         where = f"{path}, {mesh.GetPath()}"
         points, time = _points(mesh, where, MeshError)
-        counts = _whole(mesh.GetFaceVertexCountsAttr(), time)
-        indices = _whole(mesh.GetFaceVertexIndicesAttr(), time)
-        holes = _whole(mesh.GetHoleIndicesAttr(), time)
+        counts = whole_numbers(mesh.GetFaceVertexCountsAttr(), time)
+        indices = whole_numbers(mesh.GetFaceVertexIndicesAttr(), time)
+        holes = whole_numbers(mesh.GetHoleIndicesAttr(), time)
         triangles, face = triangulated(points, counts, indices, where)
         solid = ~np.isin(face, holes)
         triangles, corners = triangles[solid], corners_of(triangles, face, counts, indices)[solid]
         texture, unread = corner_texture(mesh, time, indices)
-        to_world, _ = _placement(mesh, time, where, MeshError)
+        to_world, _ = placement(mesh, time, where, MeshError)
         left_handed = mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
         if left_handed != (np.linalg.det(to_world[:3, :3]) < 0.0):
             triangles, corners = triangles[:, [0, 2, 1]], corners[:, [0, 2, 1]]
@@ -164,7 +164,9 @@ def _refuse_outside(path: Path, target: str, error: type[ValueError], outside: b
         )
 
 
-def _shapes(stage: Usd.Stage, path: Path, prim: str | None, kind: type, error: type[ValueError]) -> tuple[list, list]:
+def shapes_below(
+    stage: Usd.Stage, path: Path, prim: str | None, kind: type, error: type[ValueError]
+) -> tuple[list, list]:
     """Return (prims of a kind in a file or below the prim at a path, all other geometric prims)."""
     if prim is not None and not (isinstance(prim, str) and Sdf.Path.IsValidPathString(prim)[0]):
         raise error(f"{path}: prim = {prim!r} is no path of a prim; give one such as '/World/Hair'")
@@ -216,10 +218,10 @@ def _read_prim(curves: UsdGeom.BasisCurves, path: Path, samples: int) -> CurveSe
     name = str(curves.GetPath())
     where = f"{path}, {name}"
     points, time = _points(curves, where, CurveError)
-    counts = _whole(curves.GetCurveVertexCountsAttr(), time)
+    counts = whole_numbers(curves.GetCurveVertexCountsAttr(), time)
     closed = curves.GetWrapAttr().Get() == UsdGeom.Tokens.periodic
     checked_curves(points, counts, closed, None, name, str(path))
-    to_world, scale = _placement(curves, time, where, CurveError)
+    to_world, scale = placement(curves, time, where, CurveError)
     sampled = _sampled(curves, counts, points, samples, where)
     widths = _widths(curves, time, sampled, len(points), where)
     points = sampled.blend(points) @ to_world[:3, :3] + to_world[3, :3]
@@ -251,7 +253,7 @@ def _value(attribute: Usd.Attribute, time: Usd.TimeCode):
     return attribute.Get(time) if default is None else default
 
 
-def _whole(attribute: Usd.Attribute, time: Usd.TimeCode) -> np.ndarray:
+def whole_numbers(attribute: Usd.Attribute, time: Usd.TimeCode) -> np.ndarray:
     """Return the whole numbers of an attribute; empty without a value.
 
     Raises:
@@ -263,7 +265,7 @@ def _whole(attribute: Usd.Attribute, time: Usd.TimeCode) -> np.ndarray:
     return values.astype(int)
 
 
-def _placement(
+def placement(
     shape: UsdGeom.PointBased, time: Usd.TimeCode, where: str, error: type[ValueError]
 ) -> tuple[np.ndarray, float]:
     """Return (matrix for row vectors to metres with z up (4, 4), its mean scale)."""
@@ -280,25 +282,37 @@ def _placement(
     return matrix, volume ** (1.0 / 3.0)
 
 
-def _sampled(
-    curves: UsdGeom.BasisCurves, counts: np.ndarray, points: np.ndarray, samples: int, where: str
-) -> cubic.Sampled:
-    """Return points of each curve as weights of vertices; warn of polylines that are too short."""
+def splines(curves: UsdGeom.BasisCurves, counts: np.ndarray, where: str) -> tuple[str, str, str]:
+    """Return type, basis and wrap of curves of `counts` vertices; curves of one vertex are left to the caller.
+
+    Raises:
+        CurveError: An unknown basis, or a cubic curve whose vertices fit no segments; names the curve.
+    """
     kind, basis, wrap = (each.Get() for each in (curves.GetTypeAttr(), curves.GetBasisAttr(), curves.GetWrapAttr()))
     if kind == UsdGeom.Tokens.linear:
-        return cubic.linear(counts)
+        return kind, basis, wrap
     if kind != UsdGeom.Tokens.cubic or basis not in cubic.BASES:
         raise CurveError(
             f"{where}: the curves are of type {kind!r} and basis {basis!r}; export linear ones, or cubic ones of a basis of "
             f"{', '.join(cubic.BASES)}"
         )
-    for count in np.unique(counts):
+    for count in np.unique(counts[counts > 1]):
         if not cubic.segments(basis, wrap, int(count)):
             allowed = [str(n) for n in range(2, 16) if cubic.segments(basis, wrap, n)][:3]
             raise CurveError(
                 f"{where}: curve {np.argmax(counts == count)} is a cubic {basis} ({wrap}) of {count} vertices; such curves have "
                 f"{', '.join(allowed)}, ...: resample it"
             )
+    return kind, basis, wrap
+
+
+def _sampled(
+    curves: UsdGeom.BasisCurves, counts: np.ndarray, points: np.ndarray, samples: int, where: str
+) -> cubic.Sampled:
+    """Return points of each curve as weights of vertices; warn of polylines that are too short."""
+    kind, basis, wrap = splines(curves, counts, where)
+    if kind == UsdGeom.Tokens.linear:
+        return cubic.linear(counts)
     sampling = cubic.sampled(basis, wrap, counts, samples)
     finer = cubic.sampled(basis, wrap, counts, FINER * samples)
     closed = wrap == UsdGeom.Tokens.periodic
