@@ -11,7 +11,7 @@ Run it: `simulate`, `Dynamics`, `Statics`, `PathAnalysis`, `StopCriterion`, `Dis
 See it: `Viewer`, `movie`.
 Loops: `Integrator`, `AdaptiveStepper`, `statics`, `continuation`, `stability`.
 Query it: `Model`, `State`, `quantities`.
-Geometry, files: `meshes`, `rest_shapes`, `io`, `read_mesh`, `read_curves`.
+Geometry, files: `meshes`, `rest_shapes`, `io`, `read_mesh`, `read_curves`, `usd`.
 Learn: `Simulator` (torch), `ddg_warp.torch`, `ddg_warp.data`, `ddg_warp.rl`.
 Robots: `ddg_warp.coupling` (MuJoCo).
 Errors: `SceneError`, `SolverError`, `SceneWarning`.
@@ -28,6 +28,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time see `_HOME`
     from ddg_warp.errors import SceneError, SceneWarning, SolverError
     from ddg_warp.geometry import meshes
     from ddg_warp.io import read as read_curves
+    from ddg_warp.io import usd
     from ddg_warp.io.mesh_read import read_mesh
     from ddg_warp.model import rest_shapes
     from ddg_warp.model.controls import Controls
@@ -104,6 +105,7 @@ __all__ = [
     "simulate",
     "stability",
     "statics",
+    "usd",
 ]
 
 _HOME = {
@@ -155,6 +157,7 @@ _MODULES = {
     "rest_shapes": "model.rest_shapes",
     "stability": "solve.equilibrium.stability",
     "statics": "solve.equilibrium.statics",
+    "usd": "io.usd",
 }
 
 

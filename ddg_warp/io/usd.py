@@ -1,4 +1,4 @@
-"""Writer of recorded rods and surfaces to USD, exported together with `read_curves` and `validate`.
+"""Writer of recorded rods and surfaces to USD, exported together with readers, grooms and `validate`.
 
 All rods of a batch (of one name and one material) form one prim below /World, with its own preview surface. The prim is a linear
 BasisCurves, or a Mesh of tubes for programs without curves or curve materials. Every surface and every obstacle is one
@@ -31,10 +31,12 @@ from ddg_warp.io.shapes import Curves, Shapes
 from ddg_warp.io.usd_bodies import BodyPrim
 from ddg_warp.io.usd_check import validate
 from ddg_warp.io.usd_contact import ContactsPrim, ObstaclePrim
+from ddg_warp.io.usd_groom import Groom, open_groom
+from ddg_warp.io.usd_groom_layer import GroomLayer
 from ddg_warp.io.usd_prims import ColorBy, CurvesPrim, Frame, PointsPrim, SurfacePrim, TubesPrim
 from ddg_warp.io.usd_read import read_curves
 
-__all__ = ["CurvesWriter", "read_curves", "validate"]
+__all__ = ["CurvesWriter", "Groom", "GroomLayer", "open_groom", "read_curves", "validate"]
 
 ROOM = 2**16  # bytes of overhead of a save
 TABLE = 256  # largest table entry for a frame of a prim [bytes]
