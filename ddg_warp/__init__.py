@@ -41,9 +41,10 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time see `_HOME`
     from ddg_warp.run.recorder import Recorder
     from ddg_warp.run.simulate import simulate
     from ddg_warp.scene.descriptions import Dynamics, PathAnalysis, Statics
-    from ddg_warp.scene.drag import Granular, Viscous
+    from ddg_warp.scene.drag import Granular, QuadraticDrag, Viscous
     from ddg_warp.scene.equilibrium_path import Displacement, StopCriterion
     from ddg_warp.scene.field import Samples
+    from ddg_warp.scene.flow import FlowGrid, Gust, Turbulence
     from ddg_warp.scene.grip import Grip
     from ddg_warp.scene.law import Law
     from ddg_warp.scene.material import Circle, Ellipse, Material, Rectangle, Ribbon, Stiffness
@@ -67,8 +68,10 @@ __all__ = [
     "Displacement",
     "Dynamics",
     "Ellipse",
+    "FlowGrid",
     "Granular",
     "Grip",
+    "Gust",
     "Integrator",
     "Law",
     "Material",
@@ -77,6 +80,7 @@ __all__ = [
     "Motion",
     "PathAnalysis",
     "Plane",
+    "QuadraticDrag",
     "Recorder",
     "Rectangle",
     "Ribbon",
@@ -91,6 +95,7 @@ __all__ = [
     "Statics",
     "Stiffness",
     "StopCriterion",
+    "Turbulence",
     "Viewer",
     "Viscous",
     "bench",
@@ -117,8 +122,10 @@ _HOME = {
     "Displacement": "scene.equilibrium_path",
     "Dynamics": "scene.descriptions",
     "Ellipse": "scene.material",
+    "FlowGrid": "scene.flow",
     "Granular": "scene.drag",
     "Grip": "scene.grip",
+    "Gust": "scene.flow",
     "Integrator": "solve.stepping.integrator",
     "Law": "scene.law",
     "Material": "scene.material",
@@ -129,6 +136,7 @@ _HOME = {
     "Recorder": "run.recorder",
     "Rectangle": "scene.material",
     "Ribbon": "scene.material",
+    "QuadraticDrag": "scene.drag",
     "Samples": "scene.field",
     "Scene": "scene.scene",
     "SceneError": "errors",
@@ -141,6 +149,7 @@ _HOME = {
     "Stiffness": "scene.material",
     "StopCriterion": "scene.equilibrium_path",
     "PathAnalysis": "scene.descriptions",
+    "Turbulence": "scene.flow",
     "Viewer": "view.live",
     "Viscous": "scene.drag",
     "movie": "run.movie",

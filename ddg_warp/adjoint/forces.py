@@ -11,6 +11,7 @@ from ddg_warp.kernels.adjoint import drag, follower_loads
 from ddg_warp.kernels.core.inertia import block_inertia
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.forces.drag import ROWS
+from ddg_warp.scene.drag import is_square
 from ddg_warp.solve.forces.drag import CoupledDrag, RodGroupDrag
 from ddg_warp.solve.forces.loads import Loads
 from ddg_warp.solve.linear.sparse_system import lists
@@ -118,10 +119,10 @@ class DragAdjoint:
 
     def __init__(self, model, part, force, nodes, closed: bool, edges: int):
         self.part, self.force, real = part, force, model.types.real
-        self._edges, self._gather = drag.pull_kernels(nodes, closed, real, force.midpoint)
+        self._edges, self._gather = drag.pull_kernels(nodes, closed, real, force.midpoint, is_square(model.scene))
         self._shape, vector = (edges, part.columns), wp.types.vector(part.dim, real)
         self._by_edge, self._by_velocity, self._by_nodes = (
-            device_arrays.allocate((*rows, *self._shape), vector, model.wp_device) for rows in ((), (), (2,))
+            device_arrays.allocate((*rows, *self._shape), vector, model.wp_device) for rows in ((), (2,), (2,))
         )
 
     @property
@@ -155,7 +156,14 @@ class RodDragAdjoint(DragAdjoint):
         """Add the gradients of drag."""
         group, before, solved = self.part, pull.before, pull.solved
         tangents = pull.predicted if self.force.midpoint else before.x
-        read = [tangents, group.node_state(before), solved.x, solved.theta, self.force.coefficients, self.force.flow]
+        read = [
+            tangents,
+            group.node_state(before),
+            solved.x,
+            solved.theta,
+            self.force.coefficients,
+            self.force.flow.array,
+        ]
         outputs = [self.by_coefficients, pull.by_rate, pull.by_predicted, pull.by_fixed, group.node_state(pull.start)]
         self._pull((None, None, None, None, group.fixed), [*read, pull.w, pull.rate], *outputs)
 
@@ -205,7 +213,7 @@ class CoupledDragAdjoint(DragAdjoint):
 
         tangents = points(pull.predicted if self.force.midpoint else before.q)
         read = [tangents, coupled.node_state(before), points(pull.solved.q), None, rows(self.force.coefficients)]
-        read += [self.force.flow, components(pull.w), pull.rate]
+        read += [self.force.flow.array, components(pull.w), pull.rate]
         by_tangents = components(pull.by_predicted) if self.force.midpoint else None
         outputs = [rows(self.by_coefficients), by_world(self.by_rate), by_tangents, components(pull.by_fixed)]
         self._pull((*self._lists, None), read, *outputs, coupled.node_state(pull.start))

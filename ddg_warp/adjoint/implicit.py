@@ -23,6 +23,7 @@ from ddg_warp.model.controls import Controls, checked
 from ddg_warp.model.coupled_model import CoupledState
 from ddg_warp.model.rigid_bodies import refuse_rigid_bodies
 from ddg_warp.model.state import State, check_state
+from ddg_warp.scene.flow import depends_on_position
 
 
 @dataclass
@@ -57,6 +58,7 @@ class Adjoint:
     def __init__(self, integrator):
         refuse_rigid_bodies("gradients", integrator.model)
         self.integrator, self.model = integrator, integrator.model
+        refuse_wind("gradients", integrator.model.scene)
         refuse_gyroscopic("Adjoint", integrator.gyroscopic)
         integrator.step_whole()
         self.rod_adjoints = [RodStepAdjoint(self.model, group, integrator.scheme) for group in self.model.groups]
@@ -146,6 +148,21 @@ class Adjoint:
             coupled, read = self.coupled.vjp(parts[-1], after.coupled, cotangent.coupled, s, (before, after), factors)
             inputs.append(read)
         return State(self.model, groups, coupled, before.time, self._grips), inputs
+
+
+def refuse_wind(call: str, scene) -> None:
+    """Refuse drag without gradients: of shells, or in a flow that depends on position.
+
+    Raises:
+        SceneError: names the shell, or the flow.
+    """
+    if scene.shell_drags:
+        shell = scene.shell_drags[0].shell
+        raise SceneError(
+            f"{call}: drag of shell {shell} ('{scene.shells[shell].name}') has no gradient; only drag of rods has one"
+        )
+    if depends_on_position(scene.flow):
+        raise SceneError(f"{call}: flow depends on position, and has no gradient; give a uniform flow")
 
 
 def refuse_gyroscopic(caller: str, wanted: bool | None) -> None:

@@ -145,6 +145,7 @@ class CoupledModel:
         has_custom_mass: True if `mass` may differ from `host`.
         moves: masses of dof blocks (N,), positive where inertia or a quadratic potential determine a rate.
         coefficients: coefficients of forces on edges by name, world by world (rows, W E); see `CoupledSystem.forced_edges`.
+        shell_coefficients: coefficients of drag of triangles, world by world (2, W T); see `CoupledSystem.drag_triangles`.
         user_forces: `UserForceArrays` of the user-defined forces.
         contact_parameters: contact parameters by name: "stiffness", "range" and "friction" (worlds, groups, groups), "radius"
             (worlds, bodies).
@@ -166,6 +167,7 @@ class CoupledModel:
             name: wp.array(np.tile(values, (1, worlds)), dtype=real, device=device)
             for name, values in host.coefficients.items()
         }
+        self.shell_coefficients = wp.array(np.tile(host.shell_coefficients, (1, worlds)), dtype=real, device=device)
         held, (ends, angles) = np.zeros((host.blocks, 3)), host.forced_edges
         held[ends] = 1.0
         held[angles[angles >= 0], 0] = 1.0

@@ -116,8 +116,7 @@ def drag(model: Model, state: State) -> Drag:
         if group.kind.quadratic:
             resisted = RodGroupDrag(model, group)
             v, omega = resisted.rates(data, state.lead)
-            inertia, u = resisted.at(data, state.time)
-            force = np.einsum("krij,krj->kri", inertia["stiffness"], u - v)
+            inertia, force = resisted.at(data, state.time, v)
             moment = -inertia["spin"] * omega if group.kind.twist else moment
         work = (force * v).sum((0, 2)) + (moment * omega).sum(0)
         power += work.reshape(group.worlds, group.rods).sum(1)
@@ -129,8 +128,7 @@ def drag(model: Model, state: State) -> Drag:
         if model.coupled.host.quadratic:
             resisted = CoupledDrag(model)
             v = resisted.rates(state.coupled, state.lead)
-            inertia, u = resisted.at(state.coupled, state.time)
-            force = np.einsum("wkij,wkj->wki", inertia["stiffness"], u - v)
+            force = resisted.at(state.coupled, state.time, v)
         power += (force * v).sum((1, 2))
         _, places = model.order.coupled_rows
         turns = force[:, model.coupled.angle_start :, 0]

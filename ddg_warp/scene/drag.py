@@ -8,9 +8,9 @@ from typing import ClassVar
 import numpy as np
 
 from ddg_warp import argument_checks
-from ddg_warp.errors import SceneError, SolverError
-from ddg_warp.scene.field import Field
-from ddg_warp.typing import Floats, Numbers
+from ddg_warp.errors import SceneError
+from ddg_warp.scene.flow import flow_at
+from ddg_warp.typing import Floats, Integers, Numbers
 
 # c_t and c_n of `Viscous`
 THEORIES = {
@@ -114,6 +114,59 @@ class Viscous:
 
 
 @argument_checks.called
+@dataclass(frozen=True, eq=False)
+class QuadraticDrag:
+    """Drag of a fluid at large Reynolds numbers, such as wind on rods and shells (Taylor 1952); see `kernels.forces.drag`.
+
+    The velocities v_n across and v_t along act each by themselves, with the density rho of the fluid:
+
+        rods, per length:  rho / 2 C_n d |v_n| v_n  across, with the diameter d,  rho / 2 C_t pi d |v_t| v_t  along;
+        shells, per area:  rho / 2 C_n |v_n| v_n  along the normal,  rho / 2 2 C_t |v_t| v_t  along the surface, on both sides.
+
+    Attributes:
+        density: rho [kg/m^3], of air 1.2.
+        normal: C_n: 1.1 to 1.2 of cylinders and square plates, 2 of long plates.
+        tangential: C_t, of skin friction on one side.
+        radius: d / 2 [m] of rods, by default of the section: a number, or an array along rods (see `along_edges`).
+    """
+
+    density: float
+    normal: float = 1.2
+    tangential: float = 0.01
+    radius: Numbers | None = None
+
+    def __post_init__(self):
+        argument_checks.positive("QuadraticDrag: density", self.density, "kg/m^3")
+        for name in ("normal", "tangential"):
+            _not_negative(f"QuadraticDrag: {name}", getattr(self, name), "1")
+        if self.radius is not None:
+            radius = _numbers("QuadraticDrag: radius", self.radius, "m", "positive", np.greater)
+            object.__setattr__(self, "radius", radius)
+
+    def spread(self, along: Callable[[str, Floats], Floats]) -> "QuadraticDrag":
+        """Return the law with values on edges, `along(name, values)` of the values along rods."""
+        return self if self.radius is None else replace(self, radius=along("radius", self.radius))
+
+    def coefficients(self, where: str, radius: Floats, length: Floats) -> list[float | Floats]:
+        """Return rows of `kernels.forces.drag` for edges of radii (R, edges) of rods of lengths (R, 1)."""
+        from ddg_warp.kernels.forces.drag import SQUARE
+
+        radius = radius if self.radius is None else self.radius
+        if not np.min(radius) > 0.0:
+            raise SceneError(
+                f"{where}: its section has no radius, which QuadraticDrag goes by; give Stiffness(radius=...), or "
+                "QuadraticDrag(..., radius=...)"
+            )
+        rows = pi * self.density * self.tangential * radius, self.density * self.normal * radius
+        return [*rows, 0.0, 0.0, 0.0, 0.0, 0.0, SQUARE]
+
+    @property
+    def of_area(self) -> tuple[float, float]:
+        """Coefficients of triangles along the normal and along the surface [kg/m^3]."""
+        return 0.5 * self.density * self.normal, self.density * self.tangential
+
+
+@argument_checks.called
 @dataclass(frozen=True)
 class Granular:
     """Drag of a granular medium, a function of the direction of velocity only: see `kernels.forces.drag` (Maladen et al. 2009).
@@ -151,22 +204,6 @@ class Granular:
     def coefficients(self, where: str, radius: Floats, length: Floats) -> list[float | Floats]:
         """Return rows of `kernels.forces.drag` for edges of radii (R, edges) of rods of lengths (R, 1)."""
         return [0.0, 0.0, 0.0, self.lateral, self.friction, self.leading, np.tan(self.angle), self.speed]
-
-
-def flow_at(scene, t: float, error=SolverError) -> np.ndarray:
-    """Return the velocity (3,) [m/s] of the fluid at t.
-
-    Raises:
-        error: the flow is not finite, or leaves the plane of a planar scene; names the function and the time.
-    """
-    flow = Field("flow", scene.flow, 3).at(t, error=error)
-    if flow.shape != (3,):
-        raise error(f"flow has shape {flow.shape} at t = {t:g}; it is uniform, give (3,)")
-    if scene.dimension == 2 and flow[1] != 0.0:
-        raise error(
-            f"flow is {tuple(flow.tolist())} at t = {t:g}; a scene of dimension 2 stays in the plane of x and z, give 0 along y"
-        )
-    return flow
 
 
 def _not_negative(label: str, value, unit: str) -> float:
@@ -225,7 +262,7 @@ class RodDrag:
     """Drag of some rods: law, and force over velocity of bodies at nodes [N s/m]."""
 
     rods: np.ndarray
-    law: Resistance | Viscous | Granular
+    law: Resistance | Viscous | QuadraticDrag | Granular
     nodes: float | np.ndarray
 
     def of(self, rows: np.ndarray, batch) -> "RodDrag":
@@ -246,10 +283,14 @@ def rod_drag(batches, rods: np.ndarray, law, tangential, normal, rotational, nod
     if law is None:
         bare = nodes is not None and not has_coefficients  # bodies alone
         law = Resistance(0.0, 0.0) if bare else Resistance(tangential, normal, rotational)
-    elif not isinstance(law, Resistance | Viscous | Granular):
-        raise SceneError(f"drag: law is {law!r}; give Viscous(viscosity), Granular(...), or tangential and normal")
+    elif not isinstance(law, Resistance | Viscous | QuadraticDrag | Granular):
+        raise SceneError(
+            f"drag: law is {law!r}; give Viscous(viscosity), QuadraticDrag(density), Granular(...), or tangential and normal"
+        )
     elif has_coefficients:
         raise SceneError("drag: a law and coefficients are given; give one of them")
+    elif isinstance(law, QuadraticDrag) and np.any(bodies):
+        raise SceneError("drag: nodes is force over velocity, and QuadraticDrag is not; leave nodes out")
     result = RodDrag(rods, law, bodies)
     for batch in batches:
         rows = np.flatnonzero((rods >= batch.first) & (rods < batch.first + batch.rods))
@@ -318,19 +359,75 @@ class Laws:
 
     @staticmethod
     def check(scene) -> None:
-        """Refuse an invalid flow at t = 0, or a flow without rods with drag."""
-        flow_at(scene, 0.0, SceneError)
-        if not scene.drags and (callable(scene.flow) or any(scene.flow)):
-            raise SceneError("flow is given, and no rod feels it; call drag(...), or leave flow out")
+        """Refuse an invalid flow at t = 0, a flow without objects with drag, or laws of two kinds."""
+        if not scene.drags and not scene.shell_drags and (callable(scene.flow) or np.any(scene.flow)):
+            raise SceneError("flow is given, and nothing feels it; call drag(...), or leave flow out")
+        points = [np.zeros((0, 3)), *(batch.points[0] for batch in scene.batches), *(s.points for s in scene.shells)]
+        flow_at(scene.flow, 0.0, scene.dimension, np.concatenate(points), SceneError)
+        shells = [drag.shell for drag in scene.shell_drags]
+        for shell in shells:
+            if shells.count(shell) > 1:
+                raise SceneError(
+                    f"drag: shell {shell} ('{scene.shells[shell].name}') has drag already; give it one law"
+                )
+        kinds = {isinstance(drag.law, QuadraticDrag) for drag in (*scene.drags, *scene.shell_drags)}
+        if len(kinds) > 1:
+            raise SceneError(
+                "drag: some laws are QuadraticDrag, and some are not; a scene has one fluid, give laws of one kind"
+            )
 
     @staticmethod
     def holds(coefficients: np.ndarray) -> np.ndarray:
         """Return masks of first and last nodes of edges (2, ...) with drag in all directions, by coefficients (rows, ...)."""
-        tangential, normal, _, lateral, friction, _, _, _, first, last = coefficients
-        along = (tangential + friction > 0.0) & (normal + lateral > 0.0)
+        tangential, normal, _, lateral, friction, _, _, speed, first, last = coefficients
+        along = (tangential + friction > 0.0) & (normal + lateral > 0.0) & (speed >= 0.0)
         return np.stack([along | (first > 0.0), along | (last > 0.0)])
 
     @staticmethod
     def least(coefficients: np.ndarray) -> np.ndarray:
-        """Return the smallest drag per length and velocity [N s/m^2] of rods (R,) by coefficients (R, edges, rows); 0 if granular."""
-        return coefficients[..., :2].mean(1).min(1)
+        """Return the smallest drag per length and velocity [N s/m^2] of rods (R,) by coefficients (R, edges, rows).
+
+        0 if granular or quadratic.
+        """
+        return np.where((coefficients[..., 7] < 0.0).any(1), 0.0, coefficients[..., :2].mean(1).min(1))
+
+
+def is_square(scene) -> bool:
+    """Return True if the drag of a scene is quadratic; all its laws are of one kind."""
+    return any(isinstance(drag.law, QuadraticDrag) for drag in (*scene.drags, *scene.shell_drags))
+
+
+@dataclass(frozen=True)
+class ShellDrag:
+    """Drag of a shell: law, and coefficients of triangles (2, triangles) along the normal and along the surface.
+
+    Coefficients are of linear drag [N s/m^3], or of quadratic drag [kg/m^3]; both sides are included.
+    """
+
+    shell: int
+    law: Resistance | QuadraticDrag
+    coefficients: np.ndarray
+
+
+def shell_drag(shells, chosen: Integers, law, tangential, normal, rotational, nodes) -> list[ShellDrag]:
+    """Return the checked drags of shells by index in a call of `Scene.drag`; arguments as there."""
+    if nodes is not None or np.any(rotational):
+        raise SceneError("drag: nodes and rotational are of rods; leave them out for shells")
+    if law is None:
+        law = Resistance(tangential, normal)
+    elif not isinstance(law, QuadraticDrag):
+        raise SceneError(f"drag: law of shells is {law!r}; give QuadraticDrag(density), or tangential and normal")
+    elif tangential is not None or normal is not None:
+        raise SceneError("drag: a law and coefficients are given; give one of them")
+    result = []
+    for index in chosen:
+        count = len(shells[index].triangles)
+        values = law.of_area if isinstance(law, QuadraticDrag) else (law.normal, law.tangential)
+        for name, each in zip(("normal", "tangential"), values, strict=True):
+            if np.shape(each) not in ((), (count,)):
+                raise SceneError(
+                    f"drag: {name} has shape {np.shape(each)}, and shell '{shells[index].name}' has {count} triangles; give one "
+                    "number, or one for each"
+                )
+        result.append(ShellDrag(index, law, np.stack([np.broadcast_to(each, count) for each in values])))
+    return result

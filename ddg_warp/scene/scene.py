@@ -15,14 +15,14 @@ from ddg_warp.scene import drag, validate
 from ddg_warp.scene.descriptions import Dynamics, Load, PathAnalysis, RodBatch, Statics, Support
 from ddg_warp.scene.field import Fields
 from ddg_warp.scene.grip import Grip
-from ddg_warp.scene.handle import LOAD, ROD, SUPPORT, Handle, Handles, need
+from ddg_warp.scene.handle import LOAD, ROD, SHELL, SUPPORT, Handle, Handles, need
 from ddg_warp.scene.law import Law, laws_of
 from ddg_warp.scene.material import Material, Section, Stiffness, stiffness_of
 from ddg_warp.scene.prescribed_motion import Motion
 from ddg_warp.scene.rigid_bodies import RigidBodies
 from ddg_warp.scene.shells_and_joints import Structures
 from ddg_warp.scene.user_force import UserForces
-from ddg_warp.typing import Amplitude, Device, End, Integers, Numbers, Precision, Selection, Vector
+from ddg_warp.typing import Amplitude, Device, End, Floats, Integers, Numbers, Precision, Selection, Vector
 
 if TYPE_CHECKING:
     from ddg_warp.model.model import Model
@@ -41,7 +41,9 @@ class Scene(Structures, RigidBodies, Fields, UserForces):
         dimension: 3, or 2 for a scene in a plane y = const: forces, couples, motions and gravity out of the plane are refused.
         analysis: `Dynamics`, `Statics` or `PathAnalysis` of `ddg-warp run`.
         mass_damping: mass-proportional damping alpha [1/s].
-        flow: uniform velocity (3,) [m/s] of the fluid of `drag`; or a function of time that returns it.
+        flow: velocity of the fluid of `drag` [m/s]: uniform (3,), or a function of time that returns it. Or a field of position and
+            time, such as `FlowGrid` or `Turbulence`: a function `flow(points, t)` of points (n, 3), or (worlds, n, 3), that returns
+            velocities of that shape. It is evaluated once a step, at the nodes of the start of the step.
         initial: function of the model that returns the first state of a run; the rest state by default.
         callbacks: functions of the state, called between steps.
 
@@ -53,14 +55,15 @@ class Scene(Structures, RigidBodies, Fields, UserForces):
     dimension: int = 3
     analysis: Dynamics | Statics | PathAnalysis = field(default_factory=Dynamics)
     mass_damping: float = 0.0
-    flow: Vector | Callable[[float], Vector] = (0.0, 0.0, 0.0)
+    flow: Vector | Callable[[float], Vector] | Callable[[Floats, float], Floats] = (0.0, 0.0, 0.0)
     initial: "Callable[[Model], State] | None" = None
     callbacks: "list[Callable[[State], object]]" = field(default_factory=list)
     batches: list[RodBatch] = field(default_factory=list, init=False)
     supports: list[Support] = field(default_factory=list, init=False)
     loads: list[Load] = field(default_factory=list, init=False)
     masses: list[tuple[Integers, int, float]] = field(default_factory=list, init=False)
-    drags: list[tuple[Integers, object]] = field(default_factory=list, init=False)
+    drags: list[drag.RodDrag] = field(default_factory=list, init=False)
+    shell_drags: list[drag.ShellDrag] = field(default_factory=list, init=False)
 
     def __post_init__(self):
         validate.check_settings(self)
@@ -343,39 +346,59 @@ class Scene(Structures, RigidBodies, Fields, UserForces):
     def drag(
         self,
         rods: Selection | None = None,
-        law: drag.Viscous | drag.Granular | None = None,
+        law: drag.Viscous | drag.QuadraticDrag | drag.Granular | None = None,
         *,
+        shells: Selection | None = None,
         tangential: Numbers | None = None,
         normal: Numbers | None = None,
         rotational: Numbers = 0.0,
         nodes: Numbers | None = None,
     ) -> None:
-        """Add anisotropic drag of a fluid or granular medium on rods against `flow` (resistive force theory).
+        """Add anisotropic drag of a fluid or granular medium against `flow` on rods (resistive force theory) or shells.
 
-        Drag does not act in statics, continuation and spectra. In a time step it is implicit, with time-lagged tangents of the start
-        of the step (midpoint rule: of the predicted midpoint), which allows long steps of overdamped rods. Rods with drag in all
-        directions need no mass; velocities of massless rods are means over the last step. `Model.drag` returns forces and power.
+        Drag does not act in statics, continuation and spectra. In a time step it is implicit, which allows long steps of
+        overdamped rods, with time-lagged tangents and normals of the start of the step (midpoint rule: of the predicted midpoint).
+        Rods with linear drag in all directions need no mass. Velocities of massless rods are means over the last step. `Model.drag`
+        returns forces and power.
 
         Args:
-            rods: rods with drag, by default all added so far.
-            law: `Viscous(viscosity)` or `Granular(...)`; or the following coefficients instead. Each is a number, or an array
-                (edges,) or (rods, edges) along the rod, or (nodes,) or (rods, nodes) of open rods with linear interpolation.
-            tangential, normal: force per length over velocity along and across the rod [N s/m^2].
+            rods: rods with drag. By default all added so far, in scenes with shells only for a `QuadraticDrag`.
+            law: `Viscous(viscosity)` or `Granular(...)` of rods, `QuadraticDrag(density)` of rods and shells; or the following
+                coefficients instead. Each is a number, or an array (edges,) or (rods, edges) along the rod, or (nodes,) or
+                (rods, nodes) of open rods with linear interpolation. Of a shell it is a number or an array (triangles,).
+            shells: shells with drag, which acts on both sides. By default, without `rods`, all added so far.
+            tangential, normal: force along and across over velocity, per length of rods [N s/m^2] or per area of shells [N s/m^3].
             rotational: moment per length over the angular velocity about the tangent [N s].
             nodes: force over velocity of bodies at nodes [N s/m], such as 6 pi mu R of a ball, added to the drag of the rod. A number,
                 (nodes,) or (rods, nodes).
 
         Raises:
-            SceneError: an invalid coefficient, or, without `rods`, a scene with shells, which have no drag. At `build`, a rod with
-                two laws.
+            SceneError: an invalid coefficient or law, a shell of revolution, which has no drag, or coefficients for rods and shells
+                at once. At `build`, a rod or shell with two laws, or laws of two kinds in a scene.
         """
-        if rods is None:
-            for kind, shells in (("shell", self.shells), ("shell of revolution", self.axisymmetric_shells)):
-                if shells:
-                    raise SceneError(f"drag: {kind} 0 ('{shells[0].name}') can feel none; name the rods that do")
-            rods = range(self.rod_count)
-        rods = argument_checks.once("drag: rods", self._rods(rods))
-        self.drags.append(drag.rod_drag(self.batches, rods, law, tangential, normal, rotational, nodes))
+        if rods is None and shells is None:
+            if self.axisymmetric_shells:
+                name = self.axisymmetric_shells[0].name
+                raise SceneError(
+                    f"drag: shell of revolution 0 ('{name}') can feel none; name the rods or shells that do"
+                )
+            shells = range(len(self.shells)) if self.shells else None
+            rods = range(self.rod_count) if self.rod_count or not self.shells else None
+        if rods is not None and shells is not None and not isinstance(law, drag.QuadraticDrag):
+            raise SceneError(
+                "drag: coefficients are per length of rods and per area of shells; name the rods or the shells"
+            )
+        if rods is not None:
+            rods = argument_checks.once("drag: rods", self._rods(rods))
+            self.drags.append(drag.rod_drag(self.batches, rods, law, tangential, normal, rotational, nodes))
+        if shells is not None:
+            need(SHELL, shells)
+            shells = argument_checks.once(
+                "drag: shells", argument_checks.indices("drag: shells", shells, len(self.shells))
+            )
+            for shell in shells:
+                self._check_shell(shell)
+            self.shell_drags += drag.shell_drag(self.shells, shells, law, tangential, normal, rotational, nodes)
 
     def build(
         self, device: Device = None, precision: Precision | None = None, worlds: int = 1, allow_rounding: bool = False

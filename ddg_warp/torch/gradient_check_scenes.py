@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ddg_warp.geometry import meshes
-from ddg_warp.scene.drag import Granular
+from ddg_warp.scene.drag import Granular, QuadraticDrag
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.material import Circle, Ellipse, Material, Ribbon
 from ddg_warp.scene.obstacles import Plane, Sphere
@@ -119,6 +119,11 @@ def _sand(scene: Scene, rods) -> None:
     scene.drag(rods, Granular(lateral=0.3, friction=0.1, leading=0.05, speed=0.05))
 
 
+def _wind(scene: Scene, rods) -> None:
+    scene.flow = 0.5, 0.2, 1.0
+    scene.drag(rods, QuadraticDrag(300.0, tangential=0.1))
+
+
 def _some_drag(scene: Scene, rods) -> None:
     """Add viscous drag to one rod, granular drag to another, and a mass to the third."""
     _drag(scene, rods[0])
@@ -212,6 +217,8 @@ OBJECTS: dict[str, tuple[int, Callable]] = {
     "rod of dipoles": (3, _rod(more=_magnetised(2e5, (0.0, 1e-2, 1e-2), dipoles=True))),
     "rod with drag": (3, _rod(more=_drag)),
     "rod in sand": (3, _rod(more=_sand)),
+    "rod in wind": (3, _rod(section=Circle(0.004), more=_wind)),
+    "joined rods in wind": (3, _joined(more=_wind)),
     "joined rods with drag": (3, _joined(more=_some_drag)),
     "rod in a motion": (3, _rod(hold=lambda s, r: s.clamp(r, motion=SWING))),
     "gripped rod": (3, _rod(hold=lambda s, r: s.clamp(r, motion=Grip(pivot=(0.1, 0.0, 0.0))))),

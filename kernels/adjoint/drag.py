@@ -11,21 +11,26 @@ import warp as wp
 from ddg_warp.kernels.core.dof_map import row_functions
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.core.nodes import NodeStorage, state_type
-from ddg_warp.kernels.forces.drag import FIRST, LAST, ROTATIONAL, ROWS, edge_function
+from ddg_warp.kernels.forces.drag import FIRST, LAST, ROTATIONAL, ROWS, resistance_function
 
 
 @cache
-def work_function(dim: int, real):
-    """Return the device function `work(e, v, p, wa, za, wb, zb, spin)`: w . f of the halves of an edge and of its twist angle.
+def work_function(dim: int, real, square: bool):
+    """Return the device function `work(e, v, p, wa, za, wb, zb, spin, ra, rb)`: w . f of the halves of an edge and of its angle.
 
-    Nodes move at za, zb; `spin` is the rate of the twist angle times its w.
+    Nodes move at za, zb in the solve, and at ra, rb before, relative to the fluid; `spin` is the rate of the twist angle times its w.
+    `square`: quadratic drag, without bodies.
     """
     V, P = wp.types.vector(dim, real), wp.types.vector(ROWS, real)
-    half = edge_function(dim, real)
+    half = resistance_function(dim, real, square)
 
     @wp.func
-    def work(e: V, v: V, p: P, wa: V, za: V, wb: V, zb: V, spin: real):
-        D = half(e, v, p)
+    def work(e: V, v: V, p: P, wa: V, za: V, wb: V, zb: V, spin: real, ra: V, rb: V):
+        if wp.static(square):
+            fa = half(e, v, ra, p) * (za - ra * real(0.5))
+            fb = half(e, v, rb, p) * (zb - rb * real(0.5))
+            return -wp.dot(wa, fa) - wp.dot(wb, fb) - spin * p[wp.static(ROTATIONAL)] * wp.length(e)
+        D = half(e, v, ra, p)
         bodies = p[wp.static(FIRST)] * wp.dot(wa, za) + p[wp.static(LAST)] * wp.dot(wb, zb)
         return -wp.dot(wa, D * za) - wp.dot(wb, D * zb) - bodies - spin * p[wp.static(ROTATIONAL)] * wp.length(e)
 
@@ -33,8 +38,8 @@ def work_function(dim: int, real):
 
 
 @cache
-def pull_kernels(nodes: NodeStorage, closed: bool, real, midpoint: bool):
-    """Build the kernels of the product.
+def pull_kernels(nodes: NodeStorage, closed: bool, real, midpoint: bool, square: bool):
+    """Build the kernels of the product; `square`: quadratic drag.
 
     `edges`: write gradients by edge vectors of `tangents`, by velocities of edges before and of nodes in the solve, by coefficients.
     Add gradients by the rate and by twist angles; of the coupled system by coefficients, too.
@@ -45,7 +50,7 @@ def pull_kernels(nodes: NodeStorage, closed: bool, real, midpoint: bool):
     """
     dim, twist, coupled = nodes.dim, nodes.twist, nodes.coupled
     V, P, State = wp.types.vector(dim, real), wp.types.vector(ROWS, real), state_type(nodes, real)
-    work, (row, _) = work_function(dim, real), row_functions(dim, real)
+    work, (row, _) = work_function(dim, real, square), row_functions(dim, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def edges(
@@ -57,11 +62,11 @@ def pull_kernels(nodes: NodeStorage, closed: bool, real, midpoint: bool):
         x: wp.array2d(dtype=V),
         theta: wp.array2d(dtype=real),
         coefficients: wp.array3d(dtype=real),
-        flow: wp.array(dtype=V),
+        flow: wp.array2d(dtype=V),
         w: wp.array3d(dtype=real),
         rate: wp.array(dtype=real),
         edge_out: wp.array2d(dtype=V),
-        velocity_out: wp.array2d(dtype=V),
+        velocity_out: wp.array3d(dtype=V),
         node_out: wp.array3d(dtype=V),
         coefficient_out: wp.array3d(dtype=real),
         rate_out: wp.array2d(dtype=real),
@@ -95,18 +100,23 @@ def pull_kernels(nodes: NodeStorage, closed: bool, real, midpoint: bool):
         if angle >= 0:
             rotated = x[angle, island][0] - before.x[angle, island][0]
             w_angle = w[0, angle, island]
-        de, dv, dp, _wa, za, _wb, zb, spin = wp.grad(work)(
+        ua = flow[a, island]
+        ub = flow[b, island]
+        de, dv, dp, _wa, za, _wb, zb, spin, ra, rb = wp.grad(work)(
             tangents[b, island] - tangents[a, island],
-            (before.v[a, island] + before.v[b, island]) * real(0.5) - flow[0],
+            (before.v[a, island] + before.v[b, island]) * real(0.5) - (ua + ub) * real(0.5),
             p,
             row(w, a, island),
-            moved_a * r - flow[0],
+            moved_a * r - ua,
             row(w, b, island),
-            moved_b * r - flow[0],
+            moved_b * r - ub,
             w_angle * r * rotated,
+            before.v[a, island] - ua,
+            before.v[b, island] - ub,
         )
         edge_out[edge, island] = de
-        velocity_out[edge, island] = dv * real(0.5)
+        velocity_out[0, edge, island] = dv * real(0.5) + ra
+        velocity_out[1, edge, island] = dv * real(0.5) + rb
         node_out[0, edge, island] = za * r
         node_out[1, edge, island] = zb * r
         by_rate = wp.dot(za, moved_a) + wp.dot(zb, moved_b) + spin * w_angle * rotated
@@ -125,7 +135,7 @@ def pull_kernels(nodes: NodeStorage, closed: bool, real, midpoint: bool):
     @wp.func
     def add(
         edge_in: wp.array2d(dtype=V),
-        velocity_in: wp.array2d(dtype=V),
+        velocity_in: wp.array3d(dtype=V),
         node_in: wp.array3d(dtype=V),
         side: int,
         edge: int,
@@ -136,7 +146,7 @@ def pull_kernels(nodes: NodeStorage, closed: bool, real, midpoint: bool):
     ):
         sign = real(2 * side - 1)
         by_tangent += edge_in[edge, island] * sign
-        by_velocity += velocity_in[edge, island]
+        by_velocity += velocity_in[side, edge, island]
         by_node += node_in[side, edge, island]
         return by_tangent, by_velocity, by_node
 
@@ -147,7 +157,7 @@ def pull_kernels(nodes: NodeStorage, closed: bool, real, midpoint: bool):
         count: wp.array(dtype=int),
         fixed: wp.array2d(dtype=wp.uint8),
         edge_in: wp.array2d(dtype=V),
-        velocity_in: wp.array2d(dtype=V),
+        velocity_in: wp.array3d(dtype=V),
         node_in: wp.array3d(dtype=V),
         tangent_out: wp.array3d(dtype=real),
         fixed_out: wp.array3d(dtype=real),

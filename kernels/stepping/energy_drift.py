@@ -153,8 +153,8 @@ def element_kernel(storage: ElementStorage, real, linear):
 
 
 @cache
-def node_kernel(nodes: NodeStorage, real, quadratic: bool):
-    """Build the kernel of the rows of nodes.
+def node_kernel(nodes: NodeStorage, real, quadratic: bool, square: bool):
+    """Build the kernel of the rows of nodes; `square`: the quadratic potential is of quadratic drag, see `kernels.forces.drag`.
 
     `measure`: sum work of follower loads, kinetic energy at the end, and dissipation by damping and the quadratic potential, over the
     nodes first, first + ranges, ... of an island.
@@ -199,7 +199,12 @@ def node_kernel(nodes: NodeStorage, real, quadratic: bool):
             damped = damping[0] * rate * wp.dot(wp.cw_mul(m, moved), moved)
             if wp.static(quadratic):
                 away = x[k, island] - resisted[k, island].reference
-                damped += real(2.0) * wp.dot(away, resisted[k, island].stiffness * away)
+                relative = away  # moved less the fluid
+                if wp.static(square):
+                    offset = (before.x[k, island] - resisted[k, island].reference) * real(2.0)
+                    relative = x[k, island] - before.x[k, island] + offset
+                    relative += before.v[k, island] / scalars[INVERSE_STEP, island]
+                damped += real(2.0) * wp.dot(relative, resisted[k, island].stiffness * away)
                 if wp.static(twist):
                     rotated = moved[wp.static(nodes.dim)]
                     damped += real(2.0) * resisted[k, island].spin * rotated * rotated

@@ -251,6 +251,7 @@ def test_the_midpoint_rule_with_predictors_that_rotate_edges(name, monkeypatch):
 
 
 FLUID = {"tangential": 0.7, "normal": 1.9, "rotational": 3e-5, "nodes": 0.05}
+WIND = ddg.QuadraticDrag(2e4, tangential=0.2)
 SAND = ddg.Granular(lateral=0.3, friction=0.2, leading=0.1, speed=0.05)
 
 
@@ -284,6 +285,8 @@ LAGGED = {
     "fluid, joined": lambda: resisted("joined", **FLUID),
     "sand, twisted": lambda: resisted("twisted", law=SAND),
     "sand, joined": lambda: resisted("joined", law=SAND),
+    "wind, twisted": lambda: resisted("twisted", law=WIND),
+    "wind, joined": lambda: resisted("joined", law=WIND),
     "no inertia, twisted": lambda: resisted("twisted", 0.0, **FLUID),
     "no inertia, joined": lambda: resisted("joined", 0.0, **FLUID),
     "couple, twisted": lambda: coupled("twisted"),

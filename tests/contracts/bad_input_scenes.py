@@ -17,6 +17,8 @@ from bad_inputs import (
 
 import ddg_warp as ddg
 
+BARE = ddg.Stiffness(EA=1.0, EI1=1.0, GJ=1.0, mass_per_length=1.0)  # without radius
+
 
 def _in_fluid(scene):
     scene.drag(tangential=1.0, normal=2.0)
@@ -37,10 +39,35 @@ each(
 each("scene", "flow", [(0.0, 1.0), 3.0, "fast", (0.0, 0.0, NAN), None], lambda v: ddg.Scene(flow=v), "flow", "three finite numbers")
 each("scene", "flow to", [(0.0, 1.0), 3.0, None, (0.0, NAN, 0.0), np.zeros((2, 3))],
      lambda v: built(rods(scene=ddg.Scene(flow=lambda t: v)), _in_fluid), "flow", "t = 0")
+each("scene", "field of flow", [(1.0, 0.0, 0.0), 3.0, None, np.full((12, 3), NAN), np.zeros((2, 3))],
+     lambda v: built(rods(scene=ddg.Scene(flow=lambda points, t: v)), _in_fluid), "flow", "t = 0")
 refuse("scene", {
+    "field of flow out of the plane": (
+        lambda: built(rods(scene=ddg.Scene(dimension=2, flow=lambda points, t: points + 1.0)), _in_fluid), "flow", "0 along y"),
+    "field of flow that fails": (
+        lambda: built(rods(scene=ddg.Scene(flow=lambda points, t: points[:, 7])), _in_fluid), "flow", "IndexError"),
     "flow without drag": (lambda: built(rods(scene=ddg.Scene(flow=(1.0, 0.0, 0.0)))), "flow", "drag(...)"),
     "flow out of the plane": (
         lambda: built(rods(scene=ddg.Scene(dimension=2, flow=(0.0, 1.0, 0.0))), _in_fluid), "flow", "0 along y"),
+})
+for _name, _value, *_words in (
+    ("mean", (0.0, 0.0, 0.0), "zero"), ("mean", 8.0, "three finite numbers"), ("intensity", -0.1, "from 0"),
+    ("length", 0.0, "[m]"), ("seed", -1, "whole number"), ("modes", 0, "whole number"), ("spectrum", "white", "'kraichnan'"),
+):
+
+    def _turbulence(value, name=_name):
+        ddg.Turbulence(**({"mean": (8.0, 0.0, 0.0), "intensity": 0.1, "length": 1.0} | {name: value}))
+
+    each("scene", f"turbulence, {_name} {_value}", [_value], _turbulence, f"Turbulence: {_name}", *_words)
+refuse("scene", {
+    "gust": (lambda: ddg.Gust(6.0), "Gust: peak", "three finite numbers"),
+    "gust without duration": (lambda: ddg.Gust((6.0, 0.0, 0.0), duration=0.0), "Gust: duration", "[s]"),
+    "flow that is added": (lambda: ddg.Gust((6.0, 0.0, 0.0)) + 3.0, "flow that is added", "three finite numbers"),
+    "grid of points": (lambda: ddg.FlowGrid(np.zeros((4, 3)), (0, 0, 0), (1, 1, 1)), "(4, 3)", "(nx, ny, nz, 3)"),
+    "grid in time": (lambda: ddg.FlowGrid(np.zeros((2, 2, 2, 3)), (0, 0, 0), (1, 1, 1), [0.0, 1.0]), "(times, nx, ny, nz, 3)"),
+    "grid at times": (lambda: ddg.FlowGrid(np.zeros((2, 2, 2, 2, 3)), (0, 0, 0), (1, 1, 1), [1.0, 0.0]), "times", "ascending"),
+    "grid nan": (lambda: ddg.FlowGrid(np.full((2, 2, 2, 3), NAN), (0, 0, 0), (1, 1, 1)), "velocities", "not all finite"),
+    "grid upside down": (lambda: ddg.FlowGrid(np.zeros((2, 2, 2, 3)), (0, 0, 0), (1, -1, 1)), "upper is -1 along y", "larger"),
 })
 each("scene", "analysis", [None, "statics", 3], lambda v: ddg.Scene(analysis=v), "analysis", "Dynamics(...)")
 each("scene", "callbacks", [[5], print, [print, None]], lambda v: ddg.Scene(callbacks=v), "callbacks", "functions of the state")
@@ -299,6 +326,16 @@ LOADS = {
     "drag in sand, leading": (lambda s: s.drag(1, ddg.Granular(1.0, 1.0, leading=-2.0)), "Granular: leading", "-friction"),
     "drag in sand, angle": (lambda s: s.drag(1, ddg.Granular(1.0, 1.0, angle=2.0)), "Granular: angle", "pi / 2"),
     "drag in sand, speed": (lambda s: s.drag(1, ddg.Granular(1.0, 1.0, speed=0.0)), "Granular: speed", "positive"),
+    "drag, density": (lambda s: s.drag(1, ddg.QuadraticDrag(0.0)), "QuadraticDrag: density", "[kg/m^3]"),
+    "drag, C_n": (lambda s: s.drag(1, ddg.QuadraticDrag(1.2, -1.0)), "QuadraticDrag: normal", "not negative"),
+    "drag, radius": (lambda s: s.drag(1, ddg.QuadraticDrag(1.2, radius=0.0)), "QuadraticDrag: radius", "positive"),
+    "drag without radius": (
+        lambda s: s.drag(s.add_rod(line(), section=BARE, name="bare"), ddg.QuadraticDrag(1.2)), "'bare'", "no radius", "radius=..."),
+    "drag of nodes, quadratic": (lambda s: s.drag(1, ddg.QuadraticDrag(1.2, radius=0.1), nodes=1.0), "nodes", "leave nodes out"),
+    "drag of two kinds": (lambda s: (s.drag(0, ddg.QuadraticDrag(1.2, radius=0.1)), s.drag(1, ddg.Viscous(1.0, radius=1e-3))),
+                          "QuadraticDrag", "one kind"),
+    "drag of no shell": (lambda s: s.drag(shells=0, normal=1.0, tangential=1.0), "shell 0", "0 shells"),
+    "drag of a rod as shell": (lambda s: s.drag(shells=s.add_rod(line(), section=STIFFNESS), normal=1.0, tangential=1.0), "no shell"),
     "mass node": (lambda s: s.add_mass(1, 5, 1.0), "node 5", "rod 1", "5 nodes"),
     "mass zero": (lambda s: s.add_mass(1, 4, 0.0), "mass at node 4 is 0.0", "positive"),
     "mass negative": (lambda s: s.add_mass(1, 4, -1.0), "mass at node 4", "positive"),

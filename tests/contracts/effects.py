@@ -229,7 +229,8 @@ scene_call(
 scene_call("add_mass", {"rods": 0, "node": -1, "mass": 0.1}, {"rods": [0, 1], "node": 3, "mass": 0.2}, two_clamped_rods)
 scene_call("drag", {"rods": 0, "tangential": 1.0, "normal": 2.0}, {
     "rods": [0, 1], "law": Change(ddg.Viscous(1.0), {"tangential": NOTHING, "normal": NOTHING}, ddg.Viscous(2.0)),
-    "tangential": 2.0, "normal": 1.0, "rotational": 1.0, "nodes": 1.0}, two_clamped_rods,
+    "shells": Change(0, {"rods": NOTHING}, NOTHING), "tangential": 2.0, "normal": 1.0, "rotational": 1.0, "nodes": 1.0},
+    lambda s: (two_clamped_rods(s), s.add_shell(*meshes.rectangle(1, 1), thickness=0.01, material=RUBBER)),
     lambda s: s.add_twisting_moment(0, -1, 0.1))  # fmt: skip
 scene_call("join", {"members": [(0, -1), (1, 0)]}, {
     "members": [(0, 0), (1, 0)], "rigid": False, "laws": {"rigid_joint": ddg.Law(quadratic, stiffness=0.1)}},
@@ -294,9 +295,31 @@ def observe_drag(law) -> list:
 
 CALLS["Viscous"] = Call(ddg.Viscous, lambda **named: observe_drag(ddg.Viscous(**named)), {"viscosity": 1.0}, {
     "viscosity": 2.0, "theory": Change("gray_hancock", {"scale": 2.0}), "scale": 2.0, "radius": 0.01})  # fmt: skip
+CALLS["QuadraticDrag"] = Call(
+    ddg.QuadraticDrag, lambda **named: observe_flow((5, 1, 0), ddg.QuadraticDrag(**named)), {"density": 1e3}, {
+    "density": 1.2, "normal": 1.0, "tangential": 0.1, "radius": 0.01})  # fmt: skip
 GRANULAR = {"lateral": 10.0, "friction": 5.0}
 CALLS["Granular"] = Call(ddg.Granular, lambda **named: observe_drag(ddg.Granular(**named)), GRANULAR, {
     "lateral": 20.0, "friction": 6.0, "leading": 1.0, "angle": 0.5, "speed": 1e-1})  # fmt: skip
+
+
+def observe_flow(flow, law=None) -> list:
+    """Observe a rod in a flow."""
+    scene = ddg.Scene(flow=flow)
+    scene.add_rod(ARC, section=ddg.Circle(0.02), material=RUBBER)
+    scene.drag(0, law or ddg.QuadraticDrag(1.2))
+    return observe_steps(scene)
+
+
+WIND = {"mean": (5.0, 0.0, 0.0), "intensity": 0.2, "length": 1.0}
+CALLS["Turbulence"] = Call(ddg.Turbulence, lambda **named: observe_flow(ddg.Turbulence(**named)), WIND, {
+    "mean": (4.0, 0.0, 0.0), "intensity": 0.1, "length": 2.0, "seed": 1, "modes": 32, "spectrum": "kraichnan"})  # fmt: skip
+CALLS["Gust"] = Call(ddg.Gust, lambda **named: observe_flow(ddg.Gust(**named)), {"peak": (5.0, 0.0, 0.0)}, {
+    "peak": (4.0, 0.0, 0.0), "start": 0.005, "duration": 0.1})  # fmt: skip
+FLOWS = {"velocities": np.arange(24.0).reshape(2, 2, 2, 3), "lower": (0.0, 0.0, 0.0), "upper": (1.0, 1.0, 1.0)}
+CALLS["FlowGrid"] = Call(ddg.FlowGrid, lambda **named: observe_flow(ddg.FlowGrid(**named)), FLOWS, {
+    "velocities": np.ones((2, 2, 2, 3)), "lower": (-1.0, 0.0, 0.0), "upper": (2.0, 1.0, 1.0),
+    "times": Change([0.0, 0.01], {"velocities": np.arange(48.0).reshape(2, 2, 2, 2, 3)}, [0.0, 1.0])})  # fmt: skip
 
 
 def observe_law(density, stiffness=10.0) -> list:

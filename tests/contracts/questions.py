@@ -328,9 +328,9 @@ def strain_rate_damping(kind, variant):
 
 
 def drag(kind, variant):
-    """Drag takes power from moving rods, in each world by its velocity, and slows their fall."""
+    """Drag takes power from moving rods or shells, in each world by its velocity, and slows their fall."""
     scene, added = kind.scene(gravity=(0.0, 0.0, -1.0))
-    scene.drag(added.rods or None, tangential=1.0, normal=2.0, rotational=1e-4)
+    scene.drag(added.rods or None, tangential=1.0, normal=2.0, rotational=1e-4 if added.rods else 0.0)
     model = variant.build(scene)
     speed, factors = np.zeros((variant.worlds, model.points_count, 3)), 1.0 + np.arange(variant.worlds)
     speed[:, :, 2] = factors[:, None]

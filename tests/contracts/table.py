@@ -58,8 +58,8 @@ REFUSED = {
     "pressure": dict.fromkeys((*RODS, *JOINED, *MANY_RODS, *RODS_IN_CONTACT), ("shell 0", "does not exist")),
     "couple": dict.fromkeys((*SHELLS, "shell of revolution", "shells of both kinds"), ("rod 0", "does not exist")),
     "drag": {
-        **dict.fromkeys((*SHELLS, "shells of both kinds"), ("shell 0", "name the rods")),
-        "shell of revolution": ("shell of revolution 0", "name the rods"),
+        **dict.fromkeys(("shell of revolution", "shells of both kinds"), ("shell of revolution 0", "name the rods")),
+        "shell, curved membrane": ("shell 0", "'curved'", "statics", "membrane='flat'"),
     },
     "continuation": {"rod without bending": ("singular_start", "support dofs that move without any stiffness")},
 }

@@ -206,6 +206,10 @@ class _Builder:
             obstacles=[merged[numbers] for numbers in self.obstacles],
             markers=[merged[numbers] for numbers in self.markers],
         )
+        if scene.shell_drags:
+            triangles = (shells[drag.shell].nodes[scene.shells[drag.shell].triangles] for drag in scene.shell_drags)
+            coupled.drag_triangles = np.concatenate(list(triangles))
+            coupled.shell_coefficients = np.concatenate([drag.coefficients for drag in scene.shell_drags], axis=1)
         coupled.fixed[nodes : nodes + angles, 1:] = True
         if scene.bodies:
             centers, anchors = (

@@ -100,6 +100,7 @@ class CoupledSystem(DofStorage):
         markers: carried nodes of each rotating surface, at one radius from its first node along x, y and z at rest.
         contact_parameters: contact, None without.
         rigid_bodies: rigid bodies, None without.
+        drag_triangles, shell_coefficients: triangles with drag (T, 3), and their coefficients (2, T); see `scene.drag.ShellDrag`.
         frames: nodal frames, orthonormal rows (3, 3), of nodes on skew supports, by node; see `compile.coupled.skew_supports`.
     """
 
@@ -121,6 +122,8 @@ class CoupledSystem(DofStorage):
     contact_parameters: ContactParameters | None = None
     frames: dict[int, np.ndarray] = field(default_factory=dict)
     rigid_bodies: RigidBodyArrays | None = None
+    drag_triangles: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), int))
+    shell_coefficients: np.ndarray = field(default_factory=lambda: np.zeros((2, 0)))
 
     @property
     def blocks(self) -> int:
@@ -191,7 +194,7 @@ class CoupledSystem(DofStorage):
     @property
     def quadratic(self) -> bool:
         """True if nodes have a quadratic potential; see `kernels.core.inertia`."""
-        return any(rod.piece.kind.quadratic for rod in self.rods)
+        return any(rod.piece.kind.quadratic for rod in self.rods) or bool(len(self.drag_triangles))
 
     @cached_property
     def forced_edges(self) -> tuple[np.ndarray, np.ndarray]:

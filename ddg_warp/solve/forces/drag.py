@@ -7,8 +7,9 @@ from ddg_warp import device_arrays
 from ddg_warp.kernels.core.inertia import block_inertia
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.elements import rod_layout
-from ddg_warp.kernels.forces import drag
-from ddg_warp.scene.drag import flow_at
+from ddg_warp.kernels.forces import drag, shell_drag
+from ddg_warp.scene.drag import is_square
+from ddg_warp.solve.forces.flow import FlowVelocity
 from ddg_warp.solve.forces.force import Force
 from ddg_warp.solve.linear.sparse_system import lists
 
@@ -28,11 +29,14 @@ class Drag(Force):
 
     Attributes:
         coefficients: of edges, as rows of `kernels.forces.drag`; initially the array of the model.
+        flow: `FlowVelocity` of the fluid.
 
     Parameters:
 
         "drag.tangential", "drag.normal" [N s/m^2], "drag.rotational" [N s]
                          of the edges of rods with viscous drag, per length; rotational drag of those with twist
+        "drag.tangential", "drag.normal" [N s^2/m^3]
+                         of the edges of rods in scenes with quadratic drag
         "drag.lateral", "drag.friction", "drag.leading" [N/m], "drag.slope" (the tangent of `angle`), "drag.speed" [m/s]
                          of the edges of rods in a granular medium
         "drag.first", "drag.last" [N s/m]
@@ -46,8 +50,7 @@ class Drag(Force):
 
     def __init__(self, model, part, kernel, midpoint: bool):
         self.model, self.part, self.midpoint, self._resist = model, part, midpoint, kernel
-        self.coefficients, vector = part.coefficients[self.name], wp.types.vector(part.dim, model.types.real)
-        self.flow = wp.array(self._flow(0.0), dtype=vector, device=model.wp_device)
+        self.coefficients, self.flow = part.coefficients.get(self.name), FlowVelocity(model, part, midpoint)
 
     @staticmethod
     def has(name: str, coefficients: np.ndarray, twisted) -> np.ndarray:
@@ -63,11 +66,15 @@ class Drag(Force):
 
     def upload(self, t0: float, t1: float) -> None:
         """Upload the flow at the evaluation time of the scheme."""
-        if callable(self.model.scene.flow):
-            self.flow.assign(self._flow(0.5 * (t0 + t1) if self.midpoint else t1))
+        self.flow.upload(t0, t1)
 
-    def _flow(self, t: float) -> np.ndarray:
-        return flow_at(self.model.scene, t)[None, list(self.part.host.axes)]
+    def sample(self, before, t0: float, t1: float) -> None:
+        """Upload the flow at the nodes of a state; see `Force`."""
+        self.flow.sample(before, t0, t1)
+
+    def _balanced(self, rates: np.ndarray, flow: np.ndarray) -> np.ndarray:
+        """Return velocities b of nodes such that D (b - rates) are the forces; see `kernels.forces.drag`."""
+        return 0.5 * (flow + rates) if is_square(self.model.scene) else flow
 
     def _islands(self, rate: float) -> Islands:
         """Return islands with the inverse length of a solve."""
@@ -84,7 +91,7 @@ class RodGroupDrag(Drag):
     """Drag on a rod group in a flowing fluid."""
 
     def __init__(self, model, group, midpoint: bool = False):
-        super().__init__(model, group, drag.rod_kernel(group.kind, model.types.real), midpoint)
+        super().__init__(model, group, drag.rod_kernel(group.kind, model.types.real, is_square(model.scene)), midpoint)
 
     def freeze(self, before, newton) -> None:
         """Write inertia and target angles; see `Force`."""
@@ -97,15 +104,19 @@ class RodGroupDrag(Drag):
         self._launch(
             self._resist,
             group.node_threads,
-            [before.x, before.v, before.theta, x if self.midpoint else before.x, x, self.coefficients, self.flow]
+            [before.x, before.v, before.theta, x if self.midpoint else before.x, x, self.coefficients, self.flow.array]
             + [group.mass, group.rotary, group.count, *islands.arrays],
             [mass, rotary, target_angle],
         )
 
-    def at(self, data, t: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return inertia and drag (node, column) of a state at t over a second, and the flow (dim,)."""
+    def at(self, data, t: float, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return inertia and drag (node, column) of a state at t over a second, and the forces on nodes with rates [N]."""
         self.upload(t, t)
-        return device_arrays.download(self.inertia(data, 1.0)), self.flow.numpy()[0].astype(float)
+        self.sample(data, t, t)
+        inertia, flow = (device_arrays.download(array) for array in (self.inertia(data, 1.0), self.flow.array))
+        return inertia, np.einsum(
+            "krij,krj->kri", inertia["stiffness"], self._balanced(rates, flow.astype(float)) - rates
+        )
 
     def inertia(self, data, rate: float) -> wp.array:
         """Return inertia and drag [node][column] of a solve of length 1 / `rate` from a state."""
@@ -128,18 +139,36 @@ class RodGroupDrag(Drag):
 
 
 class CoupledDrag(Drag):
-    """Drag on the coupled rods in a flowing fluid."""
+    """Drag on the coupled rods and shells in a flowing fluid.
+
+    Attributes:
+        shell_coefficients: of triangles, world by world (2, W T), as rows of `kernels.forces.shell_drag`; None without shells in it.
+    """
 
     def __init__(self, model, midpoint: bool = False):
-        coupled, host, device = model.coupled, model.coupled.host, model.wp_device
-        super().__init__(model, coupled, drag.coupled_kernel(model.types.real), midpoint)
+        coupled, host, square = model.coupled, model.coupled.host, is_square(model.scene)
+        rods = drag.coupled_kernel(model.types.real, square) if coupled.coefficients else None
+        super().__init__(model, coupled, rods, midpoint)
         ends, angles = host.forced_edges
-        places = np.stack([*ends, np.where(angles < 0, host.blocks, angles)], -1).ravel()
-        starts, items = lists(places, host.blocks + 1)
+        self._edges = self._elements(np.stack([*ends, np.where(angles < 0, host.blocks, angles)], -1), 2)
+        self._resist_shells = self.shell_coefficients = None
+        if len(host.drag_triangles):
+            self._resist_shells = shell_drag.resist_kernel(model.types.real, square, rods is None)
+            self._triangles, self.shell_coefficients = (
+                self._elements(host.drag_triangles, 3),
+                coupled.shell_coefficients,
+            )
 
-        self.ends, self.starts, self.items = (
-            wp.array(np.ascontiguousarray(v, np.int32), dtype=int, device=device) for v in (ends.T, starts, items // 3)
-        )
+    def _elements(self, places: np.ndarray, corners: int) -> list[wp.array]:
+        """Return nodes of elements, the first `corners` of blocks (E, n), and elements by block, as offsets and items."""
+        starts, items = lists(places.ravel(), self.part.blocks + 1)
+        values = places[:, :corners], starts, items // places.shape[1]
+        return [wp.array(np.ascontiguousarray(v, np.int32), dtype=int, device=self.model.wp_device) for v in values]
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [kernel for kernel in (self._resist, self._resist_shells) if kernel]
 
     def freeze(self, before, newton) -> None:
         """Write inertia; see `Force`."""
@@ -148,22 +177,25 @@ class CoupledDrag(Drag):
     def resist(self, before, q: wp.array, mass: wp.array, load_scale: wp.array, islands) -> None:
         """Write inertia and drag `mass` of a solve from the state `before`, given the predictor q."""
         coupled = self.part
-        self._launch(
-            self._resist,
-            coupled.worlds * coupled.blocks,
-            [before.q, before.v, q if self.midpoint else before.q, q, coupled.mass, self.ends]
-            + [self.coefficients, self.starts, self.items, self.flow, load_scale, *islands.arrays]
-            + [coupled.blocks, coupled.host.nodes],
-            [mass],
-        )
+        read = [before.q, before.v, q if self.midpoint else before.q, q, coupled.mass]
+        further = [self.flow.array, load_scale, *islands.arrays, coupled.blocks, coupled.host.nodes]
+        count = coupled.worlds * coupled.blocks
+        if self._resist:
+            places, *items = self._edges
+            self._launch(self._resist, count, [*read, places, self.coefficients, *items, *further], [mass])
+        if self._resist_shells:
+            places, *items = self._triangles
+            self._launch(self._resist_shells, count, [*read, places, self.shell_coefficients, *items, *further], [mass])
 
-    def at(self, state, t: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return inertia and drag (world, block) of a state at t over a second, and the flow (blocks, 3)."""
-        coupled = self.part
+    def at(self, state, t: float, rates: np.ndarray) -> np.ndarray:
+        """Return the forces on dof blocks with rates (world, block, 3) of a state at t [N, N m]."""
         self.upload(t, t)
-        flow = np.zeros((coupled.blocks, 3))
-        flow[: coupled.host.nodes] = self.flow.numpy()[0]
-        return self.inertia(state, 1.0).numpy(), flow
+        self.sample(state, t, t)
+        balanced, nodes = np.zeros_like(rates), self.part.host.nodes
+        flow = device_arrays.download(self.flow.array).astype(float).swapaxes(0, 1)
+        balanced[:, :nodes] = self._balanced(rates, flow)[:, :nodes]
+        stiffness = self.inertia(state, 1.0).numpy()["stiffness"]
+        return np.einsum("wkij,wkj->wki", stiffness, balanced - rates)
 
     def inertia(self, state, rate: float) -> wp.array:
         """Return inertia and drag [world][block] of a solve of length 1 / `rate` from a state."""

@@ -26,6 +26,9 @@ class Force:
     def upload(self, t0: float, t1: float) -> None:
         """Upload host data of a step between t0 and t1."""
 
+    def sample(self, before, t0: float, t1: float) -> None:
+        """Upload host data that depend on the state `before` of a step between t0 and t1."""
+
     def begin(self) -> None:
         """Launch the kernels before the first solve of a step; capturable."""
 

@@ -53,7 +53,7 @@ class CoupledStep(StepDriver):
                     f"{name} = {value!r} is for uncoupled rods; with a coupled system it is {' or '.join(only)}"
                 )
         bare = ((host.mass <= 0.0) & ~host.fixed)[: host.nodes].any(1)
-        if host.quadratic:
+        if host.coefficients:
             ends, _ = host.forced_edges
             bare[ends[holds(host.coefficients)]] = False
         bare = np.flatnonzero(bare)

@@ -10,6 +10,7 @@ from ddg_warp.errors import SceneError
 from ddg_warp.kernels.elements.coupled_element import coupled_storage
 from ddg_warp.kernels.elements.rod_layout import rod_storage
 from ddg_warp.kernels.stepping import energy_drift
+from ddg_warp.scene.drag import is_square
 from ddg_warp.solve.linear.sparse_system import Sums
 from ddg_warp.timers import timer
 
@@ -107,7 +108,9 @@ class RodEnergy(_Energy):
             self._loads = [wp.clone(load) for load in self._loads]
         real = self.model.types.real
         self._elements = [energy_drift.element_kernel(rod_storage(group.kind, real), real, newton.linear)]
-        self._nodes = energy_drift.node_kernel(group.kind.nodes, real, group.kind.quadratic)
+        self._nodes = energy_drift.node_kernel(
+            group.kind.nodes, real, group.kind.quadratic, is_square(self.model.scene)
+        )
 
     @timer("energy")
     def check_drift(self, before, start) -> None:
@@ -151,7 +154,9 @@ class CoupledEnergy(_Energy):
         force = step.newton.loading.force
         self._following = [each for each in step.forces if each.follows]
         self._load = wp.clone(force) if self._following else force
-        self._nodes = energy_drift.node_kernel(coupled.nodes, real, step.inertia is not None)
+        self._nodes = energy_drift.node_kernel(
+            coupled.nodes, real, step.inertia is not None, is_square(self.model.scene)
+        )
 
     @property
     def kernels(self) -> list:

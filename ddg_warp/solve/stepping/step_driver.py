@@ -157,6 +157,12 @@ class StepDriver:
         for part in filter(None, (self.motion, self.field, *self.forces)):
             part.upload(t0, t1)
 
+    @timer("flow")
+    def sample(self, before, t0: float, t1: float) -> None:
+        """Upload the flow at the nodes of the state before a step between t0 and t1."""
+        for force in self.forces:
+            force.sample(before, t0, t1)
+
     def step(self, before, after) -> None:
         """Launch a whole step from one state to another; capturable."""
         self._launch(self._start, len(self.islands), self.islands.arrays, [])
