@@ -23,6 +23,20 @@ class DataError(ValueError):
     """Failed writing or reading of data; the message names the file or folder, the fault and the remedy."""
 
 
+class MissingPackageError(DataError, ModuleNotFoundError):
+    """Missing package of an extra; the message has the command that installs it.
+
+    Args:
+        need: what needs the package, such as "the viewer needs".
+        error: of the import; extra: of pyproject.toml.
+    """
+
+    def __init__(self, need: str, error: ModuleNotFoundError, extra: str):
+        command = f"`pip install 'ddg-warp[{extra}]'`, in a clone `pip install -e '.[{extra}]'`"
+        super().__init__(f"{need} the package {error.name}: {command}")
+        self.name = error.name
+
+
 class SolverError(RuntimeError):
     """Failed step or equilibrium solve.
 

@@ -8,11 +8,11 @@ import pytest
 from movies import content, fallen
 
 import ddg_warp as ddg
-from ddg_warp.errors import DataError
+from ddg_warp.errors import DataError, MissingPackageError
 from ddg_warp.run import movie as movies_module
 from ddg_warp.run.cli import main
 from ddg_warp.run.movie import film_frames
-from ddg_warp.run.render import MissingRendererError, pyvista_module
+from ddg_warp.run.render import pyvista_module
 
 SIZE = (160, 96)
 
@@ -110,7 +110,7 @@ def test_invalid_arguments_are_refused(run, tmp_path):
 def test_a_missing_package_is_named_with_its_command(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "pyvista", None)
     pyvista_module.cache_clear()
-    with pytest.raises(MissingRendererError, match=r"need pyvista: run `pip install ddg-warp\[render\]`"):
+    with pytest.raises(MissingPackageError, match=r"need the package pyvista: `pip install 'ddg-warp\[render\]'`"):
         ddg.movie(tmp_path, tmp_path / "a.mp4")
     assert main(["run", "cantilever", "--movie", str(tmp_path / "a.mp4")]) == 2
     pyvista_module.cache_clear()

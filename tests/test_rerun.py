@@ -36,5 +36,5 @@ def test_a_run_is_exported_as_a_movie(recorded, tmp_path):
 def test_a_missing_package_is_named_with_its_command(recorded, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert main(["export", str(recorded), "--to", str(tmp_path / "fall.rrd")]) == 2
-    assert "pip install ddg-warp[rerun]" in capsys.readouterr().err
+    assert "pip install 'ddg-warp[rerun]'" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

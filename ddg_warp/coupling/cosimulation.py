@@ -58,7 +58,7 @@ class MuJoCo:
 
     Raises:
         SceneError: a name is unknown, a support has no grip, the model has several worlds, or options do not fit.
-        MissingMuJoCoError: the package mujoco is missing.
+        MissingPackageError: the package mujoco is missing.
     """
 
     def __init__(

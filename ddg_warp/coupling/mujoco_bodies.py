@@ -44,7 +44,7 @@ def add_bodies(scene, mj_model, *, data=None, ctrl: Mapping[str, float | Callabl
     Raises:
         SceneError: the model has features that rigid bodies lack; the message lists all of them. Examples are slides, several joints of
             a body, springs of balls, armature or friction of joints, actuators other than motors and servos of hinges, and tendons.
-        MissingMuJoCoError: the package mujoco is missing.
+        MissingPackageError: the package mujoco is missing.
     """
     call = "add_bodies"
     mj_model = compiled(call, mj_model)

@@ -6,28 +6,21 @@ from pathlib import Path
 import numpy as np
 
 from ddg_warp import argument_checks
-from ddg_warp.errors import DataError, SceneError
+from ddg_warp.errors import MissingPackageError, SceneError
 
 WORLD = 0  # MuJoCo's index of the world body
-
-
-class MissingMuJoCoError(DataError, ImportError):
-    """Coupling without the package mujoco."""
 
 
 def mujoco_module():
     """Import mujoco.
 
     Raises:
-        MissingMuJoCoError: the package is missing; the message has the command that installs it.
+        MissingPackageError: the package is missing; the message has the command that installs it.
     """
     try:
         import mujoco
     except ModuleNotFoundError as error:
-        raise MissingMuJoCoError(
-            f"coupling needs the package {error.name}: run `pip install ddg-warp[mujoco]`, or `pip install -e .[mujoco]` in the folder "
-            "of ddg_warp"
-        ) from error
+        raise MissingPackageError("coupling needs", error, "mujoco") from error
     return mujoco
 
 

@@ -86,7 +86,7 @@ def add_obstacles(scene, mj_model, bodies: Iterable[str] | str | None = None, *,
 
     Raises:
         SceneError: a name is unknown, or a shape is not supported (height fields, planes that move, signed distances).
-        MissingMuJoCoError: the package mujoco is missing.
+        MissingPackageError: the package mujoco is missing.
     """
     call = "add_obstacles"
     mj_model = compiled(call, mj_model)

@@ -19,15 +19,16 @@ from pathlib import Path
 
 import numpy as np
 
+from ddg_warp.errors import DataError, MissingPackageError, SceneError
+
 try:
     import torch
 except ModuleNotFoundError as error:
-    raise ModuleNotFoundError("data sets need torch: `pip install 'ddg-warp[torch]'`", name="torch") from error
+    raise MissingPackageError("data sets need", error, "torch") from error
 
 from ddg_warp import argument_checks
 from ddg_warp.data.episodes import INDEX, Episodes, inside
 from ddg_warp.data.splits import SPLITS
-from ddg_warp.errors import DataError, SceneError
 from ddg_warp.io.hdf5_read import TrajectoryReader
 from ddg_warp.io.paths import as_path, is_file
 from ddg_warp.run.run_directory import TRAJECTORY

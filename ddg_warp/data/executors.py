@@ -10,7 +10,7 @@ import pickle
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 
-from ddg_warp.errors import SceneError
+from ddg_warp.errors import MissingPackageError, SceneError
 
 KEPT = "finished runs are kept, and the same call continues from there"
 AHEAD = 2  # tasks in flight per worker, so that none is inactive between tasks
@@ -59,14 +59,12 @@ def require_ray():
     """Import and return the module `ray`.
 
     Raises:
-        ModuleNotFoundError: Ray is not installed.
+        MissingPackageError: Ray is not installed.
     """
     try:
         import ray
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            "Ray is not installed: `pip install 'ddg-warp[ray]'`, or leave ray out to work here", name="ray"
-        ) from error
+        raise MissingPackageError("work on a cluster needs", error, "ray") from error
     return ray
 
 

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
+from ddg_warp.errors import MissingPackageError
 from ddg_warp.run.scene_registry import SHARED, InputError, load_scene, parameters, refused, scene_name
 
 FLAGS = (
@@ -125,7 +126,7 @@ def gradients_table(chosen: argparse.Namespace) -> int:
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
-        raise InputError("gradients needs torch; pip install 'ddg-warp[torch]'") from error
+        raise MissingPackageError("gradients need", error, "torch") from error
     requested = {
         "objects": (chosen.objects, gradient_check.OBJECTS),
         "--analysis": (chosen.analysis or [], gradient_check.ANALYSES),

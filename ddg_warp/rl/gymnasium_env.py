@@ -11,18 +11,17 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ddg_warp.errors import MissingPackageError, SceneError
+
 try:
     import gymnasium
     import torch
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(
-        f"environments of gymnasium need {error.name}: `pip install 'ddg-warp[gym]'`", name=error.name
-    ) from error
+    raise MissingPackageError("environments of gymnasium need", error, "gym") from error
 
 from ddg_warp import argument_checks
-from ddg_warp.errors import SceneError
 from ddg_warp.rl.environment import Environment, EpisodeState, check_environment
 
 RENDER_MODES = ["rgb_array"]

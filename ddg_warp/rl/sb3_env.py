@@ -8,14 +8,13 @@ Ended episodes restart in the same step.
 
 import numpy as np
 
+from ddg_warp.errors import MissingPackageError, SceneError
+
 try:
     from stable_baselines3.common.vec_env import VecEnv
 except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(
-        f"environments of Stable-Baselines3 need {error.name}: `pip install 'ddg-warp[sb3]'`", name=error.name
-    ) from error
+    raise MissingPackageError("environments of Stable-Baselines3 need", error, "sb3") from error
 
-from ddg_warp.errors import SceneError
 from ddg_warp.rl.environment import Environment
 from ddg_warp.rl.gymnasium_env import VectorEnvironment
 

@@ -7,15 +7,15 @@
 Gradients go through the policy and all steps.
 """
 
+from ddg_warp.errors import MissingPackageError
+
 try:
     import torch
     from tensordict import TensorDict
     from torchrl.data import Binary, Bounded, Composite, Unbounded
     from torchrl.envs import EnvBase
 except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(
-        "environments of TorchRL need torchrl: `pip install 'ddg-warp[torchrl]'`", name=error.name
-    ) from error
+    raise MissingPackageError("environments of TorchRL need", error, "torchrl") from error
 
 from ddg_warp import argument_checks
 from ddg_warp.rl.environment import Environment, check_environment

@@ -11,6 +11,7 @@ import shlex
 import sys
 from pathlib import Path
 
+from ddg_warp.errors import MissingPackageError
 from ddg_warp.run.run_directory import FULL, SUMMARY, RunDirectory, refuse_to_replace, system_error
 from ddg_warp.run.scene_registry import (
     RUN_SETTINGS,
@@ -51,7 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
     except BrokenPipeError:  # the reader, such as `head`, has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return UNREAD
-    except (InputError, OSError) as error:
+    except (InputError, MissingPackageError, OSError) as error:
         print(f"ddg-warp: {_of_location(error)}", file=sys.stderr)
         return FAILED if getattr(error, "errno", None) in FULL else MISTAKE
     except KeyboardInterrupt:

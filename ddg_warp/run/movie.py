@@ -65,7 +65,7 @@ def movie(
         progress: Whether to show progress.
 
     Raises:
-        MissingRendererError: pyvista or imageio-ffmpeg is missing.
+        MissingPackageError: pyvista or imageio-ffmpeg is missing.
         SceneError: An argument is invalid.
         DataError: There is no run, or it has no frame or no such field.
         RecordError: The file cannot be written.
@@ -93,7 +93,7 @@ def movie(
 
 
 def check_packages() -> None:
-    """Raise a MissingRendererError unless pyvista and imageio-ffmpeg are installed."""
+    """Raise a MissingPackageError unless pyvista and imageio-ffmpeg are installed."""
     pyvista_module()
     try:
         import imageio_ffmpeg  # noqa: F401

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from ddg_warp.errors import DataError
+from ddg_warp.errors import MissingPackageError
 from ddg_warp.geometry import meshes
 from ddg_warp.geometry.operators import vertex_normals
 from ddg_warp.io.rod_tubes import SIDES, tube_faces, tube_points
@@ -25,10 +25,6 @@ LIGHTS = (
 )  # position in camera coordinates, intensity
 
 
-class MissingRendererError(DataError, ImportError):
-    """Image or movie without the packages of the extra `render`."""
-
-
 def available() -> bool:
     """Return True if pyvista can be imported."""
     try:
@@ -43,7 +39,7 @@ def pyvista_module():
     """Import pyvista.
 
     Raises:
-        MissingRendererError: The package is missing; the message has the command that installs it.
+        MissingPackageError: The package is missing; the message has the command that installs it.
     """
     try:
         import pyvista
@@ -52,9 +48,9 @@ def pyvista_module():
     return pyvista
 
 
-def missing(error: ModuleNotFoundError) -> MissingRendererError:
+def missing(error: ModuleNotFoundError) -> MissingPackageError:
     """Return the error for a missing package of the extra `render`."""
-    return MissingRendererError(f"shaded images and movies need {error.name}: run `pip install ddg-warp[render]`")
+    return MissingPackageError("shaded images and movies need", error, "render")
 
 
 @dataclass(frozen=True)

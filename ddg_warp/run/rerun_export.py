@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ddg_warp.errors import DataError
+from ddg_warp.errors import MissingPackageError
 from ddg_warp.io.colors import CONTACT, OBSTACLE, PALETTE
 from ddg_warp.view.drawing import ARROW_LENGTH, arrows, as_bytes
 from ddg_warp.view.recording import Recording
@@ -16,12 +16,13 @@ def export_rerun(directory: str | Path, path: str | Path) -> None:
     """Write rods, surfaces, obstacles and contact forces of a recorded run as NAME.rrd, decimated as in `Viewer`.
 
     Raises:
-        DataError: The package rerun-sdk is missing, or there is no run in the directory.
+        MissingPackageError: The package rerun-sdk is missing.
+        DataError: There is no run in the directory.
     """
     try:
         import rerun
     except ModuleNotFoundError as error:
-        raise DataError(f"the export needs {error.name}: run `pip install ddg-warp[rerun]`") from error
+        raise MissingPackageError("the export needs", error, "rerun") from error
     frames, path = Recording(directory), Path(path)
     drawing, newtons = frames.drawing, frames.typical_force()
     nodes, curves = drawing.tubes()

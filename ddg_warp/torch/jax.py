@@ -13,14 +13,15 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ddg_warp.errors import MissingPackageError, SceneError
+
 try:
     import jax
     import torch
 except ModuleNotFoundError as error:
-    raise ModuleNotFoundError("functions of JAX need jax: `pip install 'ddg-warp[jax]'`", name=error.name) from error
+    raise MissingPackageError("functions of JAX need", error, "jax") from error
 
 from ddg_warp import argument_checks
-from ddg_warp.errors import SceneError
 
 
 def from_torch(function: Callable, shape: tuple[int, ...], dtype=None) -> Callable:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import html
 
+from ddg_warp.errors import MissingPackageError
 from ddg_warp.view.drawing import Drawing, Frame
-from ddg_warp.view.stage import MissingViewerError, Stage
+from ddg_warp.view.stage import Stage
 
 HEIGHT = 400  # [pixels]
 
@@ -19,7 +20,7 @@ def state_frame(model, state) -> str | None:
     drawing = Drawing(model.curves, model.surfaces, model.worlds, points, model.obstacles)
     try:
         stage = Stage(drawing)
-    except MissingViewerError:
+    except MissingPackageError:
         return None
     try:
         stage.aim(frame)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ddg_warp.errors import DataError
+from ddg_warp.errors import DataError, MissingPackageError
 from ddg_warp.geometry.operators import vertex_normals
 from ddg_warp.io.colors import CONTACT, OBSTACLE
 from ddg_warp.view.drawing import (
@@ -34,22 +34,16 @@ OBSTACLE_TRIANGLES = 20_000  # drawn at most, of all obstacles that move, and of
 NO_SHADOW = {"cast_shadow": False, "receive_shadow": False}
 
 
-class MissingViewerError(DataError, ImportError):
-    """Viewer without the package viser."""
-
-
 def viser_module():
     """Import viser.
 
     Raises:
-        MissingViewerError: The package is missing; the message has the command that installs it.
+        MissingPackageError: The package is missing; the message has the command that installs it.
     """
     try:
         import viser
     except ModuleNotFoundError as error:
-        raise MissingViewerError(
-            f"the viewer needs the package {error.name}: run `pip install -e .[view]` in the folder of ddg_warp"
-        ) from error
+        raise MissingPackageError("the viewer needs", error, "view") from error
     return viser
 
 

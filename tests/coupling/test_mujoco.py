@@ -141,7 +141,7 @@ def test_refusals_of_the_coupling(mujoco):
 
 def test_a_missing_package_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(ImportError, match=r"pip install ddg-warp\[mujoco\]"):
+    with pytest.raises(ImportError, match=r"pip install 'ddg-warp\[mujoco\]'"):
         ddg.coupling.add_bodies(ddg.Scene(), "arm.xml")
 
 

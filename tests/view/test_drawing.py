@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import ddg_warp as ddg
+from ddg_warp.errors import MissingPackageError
 from ddg_warp.geometry import meshes
 from ddg_warp.io.colors import SCALE
 from ddg_warp.io.contact_records import Contacts
@@ -262,10 +263,10 @@ def test_a_missing_package_is_named_with_the_remedy(monkeypatch):
     import sys
 
     from ddg_warp.view.notebook import state_frame
-    from ddg_warp.view.stage import MissingViewerError, viser_module
+    from ddg_warp.view.stage import viser_module
 
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(MissingViewerError, match=r"pip install -e \.\[view\]"):
+    with pytest.raises(MissingPackageError, match=r"pip install -e '\.\[view\]'"):
         viser_module()
     assert state_frame(None, None) is None
 
