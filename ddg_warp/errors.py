@@ -27,7 +27,7 @@ class MissingPackageError(DataError, ModuleNotFoundError):
     """Missing package of an extra; the message has the command that installs it.
 
     Args:
-        need: what needs the package, such as "the viewer needs".
+        need: subject and verb of the message, such as "the viewer needs".
         error: of the import; extra: of pyproject.toml.
     """
 
