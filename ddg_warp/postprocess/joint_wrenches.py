@@ -7,6 +7,7 @@ import numpy as np
 
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.terms import BODY_JOINTS
+from ddg_warp.model.rigid_bodies import BodyState, body_states
 from ddg_warp.scene.handle import BODY_JOINT, named
 from ddg_warp.solve.equilibrium.tangent import Tangent
 from ddg_warp.solve.equilibrium.tangent_part import TangentBlock
@@ -81,10 +82,11 @@ def joint_wrenches(
             if part.term.name == "hinge":
                 moments[:, joints] = -gradient[SECOND_ROTATION]
     q = state.coupled.q.numpy().astype(float).reshape(worlds, -1, 3)
+    bodies = body_states(state) if any(joint.damping for joint in scene.body_joints) else None
     pinned: set[int] = set()
     for number, joint in enumerate(scene.body_joints):
         if joint.damping:
-            moments[:, number] -= _damping(state, joint)
+            moments[:, number] -= _damping(bodies, joint)
         if joint.first < 0 and joint.second not in pinned:
             pinned.add(joint.second)
             forces[:, number] -= force[:, joint.second]
@@ -95,12 +97,11 @@ def joint_wrenches(
     return JointWrenches((Reaction(*(v[0] if worlds == 1 else v for v in each)) for each in values), scene)
 
 
-def _damping(state: "State", joint) -> Floats:
+def _damping(bodies: BodyState, joint) -> Floats:
     """Return the damping torque of a hinge, opposite to the hinge's rate, with the sign of the first body (worlds, 3) [N m]."""
-    bodies = [None if body < 0 else state.body(body) for body in (joint.first, joint.second)]
-    rates = [np.zeros(3) if body is None else body.angular_velocity for body in bodies]
-    axis = np.atleast_2d(bodies[1].rotation @ joint.axis)
-    return joint.damping * np.sum(np.atleast_2d(rates[1] - rates[0]) * axis, axis=1, keepdims=True) * axis
+    first, second = (0.0 if body < 0 else bodies.angular_velocity[:, body] for body in (joint.first, joint.second))
+    axis = bodies.rotation[:, joint.second] @ joint.axis
+    return joint.damping * np.sum((second - first) * axis, axis=1, keepdims=True) * axis
 
 
 def require_joints(call: str, model: "Model") -> None:
