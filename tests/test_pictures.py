@@ -4,11 +4,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
 from ddg_warp.io.rod_tubes import SIDES
-from ddg_warp.run import figure
+from ddg_warp.run import figure, plots
 from ddg_warp.run.cli import main
 from ddg_warp.run.panel import tubes
 from ddg_warp.run.scene_registry import load_scene, one_liner, scene_files
@@ -19,7 +20,8 @@ from ddg_warp.run.simulate import simulate
 def drawn(monkeypatch) -> list:
     """Return figures that are drawn instead of written."""
     figures = []
-    monkeypatch.setattr(figure, "_save", lambda figure, path: figures.append(figure))
+    for module in (figure, plots):
+        monkeypatch.setattr(module, "save", lambda figure, path: figures.append(figure))
     return figures
 
 
@@ -100,7 +102,7 @@ def test_axes_are_equal_and_without_offsets(drawn):
     figure.rods_picture(scene.build("cpu"), {0.0: points}, "unused.png")
     (plot,) = drawn[0].axes
     assert plot.get_aspect() == 1.0
-    figure.FigureCanvasAgg(drawn[0]).draw()
+    FigureCanvasAgg(drawn[0]).draw()
     assert plot.xaxis.get_offset_text().get_text() == plot.yaxis.get_offset_text().get_text() == ""
 
 
@@ -158,7 +160,7 @@ def test_learned_lines_and_named_shapes_are_labelled(drawn):
     """Lines of one label have one color and one legend entry; named shapes are labelled by name."""
     x = np.arange(3.0)
     lines = [("seen", x, x, "o"), ("learned", x, 2.0 * x, "-"), ("learned", x, 3.0 * x, "-")]
-    figure.lines_plot("unused.png", lines, "time [s]", "height [m]")
+    plots.lines_plot("unused.png", lines, "time [s]", "height [m]")
     (plot,) = drawn[0].axes
     assert [text.get_text() for text in plot.get_legend().get_texts()] == ["seen", "learned"]
     assert plot.lines[1].get_color() == plot.lines[2].get_color() != plot.lines[0].get_color()
@@ -177,7 +179,7 @@ def test_slim_shapes_fit_their_panels(drawn, plain):
     module = load_scene("hair")
     result = simulate(module.build(strands=4), device="cpu", duration=1.0 / 60.0, progress=False)
     figure.rods_picture(result.model, path="unused.png", **module.picture(result, {0.0: result.state.points()}))
-    figure.FigureCanvasAgg(drawn[0]).draw()
+    FigureCanvasAgg(drawn[0]).draw()
     (plot,) = drawn[0].axes
     limits = np.array([plot.get_xlim(), plot.get_ylim(), plot.get_zlim()])
     matrix = plot.get_proj()
@@ -199,7 +201,7 @@ def test_titles_fit(drawn, plain):
     model = scene.build("cpu")
     for path in scene_files().values():
         figure.rods_picture(model, {0.0: points}, "unused.png", one_liner(path))
-        canvas = figure.FigureCanvasAgg(drawn[-1])
+        canvas = FigureCanvasAgg(drawn[-1])
         title = drawn[-1].get_suptitle() and drawn[-1]._suptitle.get_window_extent(canvas.get_renderer())
         assert title.x1 < drawn[-1].bbox.x1, path
 

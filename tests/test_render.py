@@ -87,7 +87,7 @@ def test_a_closed_surface_is_open_towards_its_inside():
 
 def test_solid_pictures_are_rendered_with_a_ruler_and_marks(monkeypatch):
     figures = []
-    monkeypatch.setattr(figure, "_save", lambda figure, path: figures.append(figure))
+    monkeypatch.setattr(figure, "save", lambda figure, path: figures.append(figure))
     scene = ddg.Scene()
     points = np.linspace((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 9)
     scene.add_rod(points, section=ddg.Circle(RADIUS), material=ddg.Material(1e6))
@@ -108,7 +108,7 @@ def test_solid_pictures_are_rendered_with_a_ruler_and_marks(monkeypatch):
 
 def test_curves_of_a_file_without_radii_are_rendered(monkeypatch):
     figures = []
-    monkeypatch.setattr(figure, "_save", lambda figure, path: figures.append(figure))
+    monkeypatch.setattr(figure, "save", lambda figure, path: figures.append(figure))
     points = np.linspace((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 9)
     curves = CurveSet(points, np.array([9]), np.array([False]), None, "/hair")
     figure.rods_picture(curves, {0.0: points}, "unused.png")

@@ -18,7 +18,7 @@ import torch
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp.run.figure import error_plot
+from ddg_warp.run.plots import error_plot
 from ddg_warp.run.summary import machine, table, write_table
 from ddg_warp.torch import Simulator
 

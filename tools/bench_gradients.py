@@ -26,7 +26,7 @@ import torch
 import warp as wp
 
 import ddg_warp as ddg
-from ddg_warp.run import figure
+from ddg_warp.run import plots
 from ddg_warp.run.summary import machine, table, write_table
 from ddg_warp.torch import Simulator
 
@@ -160,7 +160,7 @@ def scaling(device: str, out: Path) -> list[dict]:
                 for column in columns
             ]
             picture = out / f"gradients_{quantity}_by_{study}_{device.partition(':')[0]}.png"
-            figure.error_plot(picture, drawn, study, quantity, "of", "roll-outs")
+            plots.error_plot(picture, drawn, study, quantity, "of", "roll-outs")
     return rows
 
 

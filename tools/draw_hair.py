@@ -8,7 +8,7 @@ Writes tools/results/bench_cpu/hair_before_after.png and tools/results/bench_h20
 import csv
 from pathlib import Path
 
-from ddg_warp.run.figure import error_plot
+from ddg_warp.run.plots import error_plot
 
 RESULTS = Path(__file__).parent / "results"
 TABLES = {"bench_cpu": "hair", "bench_h200": "hair_strands_512"}

@@ -351,7 +351,7 @@ def line_through(study: Study, rows: list[Row], case: Mapping[str, Setting], nam
 def plot(study: Study, rows: list[Row], path: Path, title: str, unit: str) -> None:
     """Plot error over time, a line a series, with defaults marked; see `Study.series` and `Study.one_by_one`."""
     try:
-        from ddg_warp.run.figure import error_plot
+        from ddg_warp.run.plots import error_plot
     except ModuleNotFoundError as error:
         LOG.warning("no plot without %s: `pip install matplotlib`", error.name)
         return

@@ -58,7 +58,7 @@ def _row(name: str, study: dict) -> dict:
 def picture(rows: list[dict], path: Path) -> None:
     """Draw the time to each accuracy, a line a scene, and the defaults as a cross."""
     try:
-        from ddg_warp.run.figure import levels_plot
+        from ddg_warp.run.plots import levels_plot
     except ModuleNotFoundError as error:
         LOG.warning("no picture without %s: `pip install matplotlib`", error.name)
         return

@@ -39,10 +39,11 @@ def draw(directory: Path, module, result, shapes: int = 6) -> None:
     - `LENGTH_UNIT`;
     - `picture(result, frames)`: arguments of `figure.rods_picture`, such as other `points_by_time`, instead of `frames`, the points
       by time;
-    - `plot(result)`: arguments of `figure.lines_plot`, drawn to DIR/learned.png if its check has set `result.learned`.
+    - `plot(result)`: arguments of `plots.lines_plot`, drawn to DIR/learned.png if its check has set `result.learned`.
     """
     try:
-        from ddg_warp.run.figure import lines_plot, path_plot, rods_picture
+        from ddg_warp.run.figure import rods_picture
+        from ddg_warp.run.plots import lines_plot, path_plot
     except ModuleNotFoundError as error:
         LOG.warning("no picture without %s: `pip install matplotlib`", error.name)
         return
