@@ -168,11 +168,16 @@ def condense_kernel(real, linear, quadratic: bool, alone: bool):
         left: wp.array(dtype=int),
         right: wp.array(dtype=int),
         positions: int,
+        shift: wp.array(dtype=linear),
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
         matrix: wp.array2d(dtype=linear),
     ):
-        """`rows`: dof block of a diagonal entry, else -1; `turning`: the body if this is its rotation, else -1."""
+        """Write entries.
+
+        `rows`: dof block of a diagonal entry, else -1. `turning`: the body if this is its rotation, else -1. `shift`: added to the
+        diagonal of blocks (N,), or empty.
+        """
         w, t = wp.tid()
         if flags[NEEDS_DIRECTION, w] == 0:
             return
@@ -192,6 +197,8 @@ def condense_kernel(real, linear, quadratic: bool, alone: bool):
             m += k
         if turning[t] >= 0:
             m += M(bodies.inertia[turning[t] + w * bodies.origins.shape[0]])
+        if shift.shape[0] > 0 and rows[t] >= 0:
+            m += wp.identity(n=3, dtype=linear) * shift[rows[t]]
         for i in range(3):
             for j in range(3):
                 matrix[3 * i + j, target] = m[i, j]

@@ -116,7 +116,7 @@ def rests(kind, variant):
     model = variant.build(scene)
     state = statics.solve(model)
     pairs, forces = model.contacts(state), [variant.each(reaction.force) for reaction in model.reactions(state)]
-    ball_force, weight = np.zeros((variant.worlds, 3)), 0.5 * _mass(model).sum()
+    ball_force, weight = np.zeros((variant.worlds, 3)), 0.5 * (_mass(model).sum() + body_masses(model).sum())
     first = pairs.objects[:, :1] == len(pairs.names) - 1  # the ball: opposite force
     np.add.at(ball_force, pairs.world, np.where(first, -pairs.force, pairs.force))
     assert (pairs.gap > 0.0).all()

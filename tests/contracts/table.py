@@ -81,7 +81,6 @@ REFUSED["rolls"] = dict.fromkeys(SHELLS, ("contact: rolling", "no rod is in cont
 for _name in ("rod without twist", "rod without bending"):
     REFUSED["rolls"][_name] = ("rolling, and rod 0", "has no twist", "leave rolling out")
 REFUSED["rests"] = {name: words for name, words in REFUSED["contact"].items() if name != "shell, curved membrane"}
-REFUSED["rests"]["rod with a body"] = ("statics with contact", "body 0 ('box')", "rigid")
 REFUSED["spectrum"] = dict.fromkeys(IN_CONTACT, ("contact: stability", "friction", "set friction=0", "statics.solve"))
 REFUSED["continuation"] |= dict.fromkeys(
     IN_CONTACT, ("contact: ", "paths", "friction", "set friction=0", "statics.solve")
@@ -90,7 +89,7 @@ REFUSED["path onto a ball"] = REFUSED["rests"] | {"rod without bending": REFUSED
 REFUSED["implicit midpoint"] |= dict.fromkeys(IN_CONTACT, ("contact: ", "use 'implicit_euler'"))
 REFUSED["failure"] |= dict.fromkeys(IN_CONTACT, ("contact: ", "'ball'", "overlap", "separate them"))
 # questions refused for several worlds, and objects with an earlier refusal
-ALONE = {"continuation": {}, "path onto a ball": REFUSED["rests"].keys() - {"rod with a body"}}
+ALONE = {"continuation": {}, "path onto a ball": REFUSED["rests"]}
 
 
 def answer(name: str, question: str, variant: Variant) -> str:

@@ -91,6 +91,15 @@ class CarriedDofs:
         rotation = state.rotation.numpy().astype(float)
         return self.bodies, rotation, np.tile(self._moments, (len(rotation) // len(self._moments), 1))
 
+    def rotated(self, q: np.ndarray, state, reference) -> np.ndarray:
+        """Return dofs q (size,) with the rotation vectors of bodies from a `reference` to a coupled state."""
+        from scipy.spatial.transform import Rotation
+
+        result = q.reshape(-1, 3).copy()
+        end, start = (each.rotation.numpy().astype(float) for each in (state, reference))
+        result[self.bodies] = Rotation.from_matrix(end @ start.transpose(0, 2, 1)).as_rotvec()
+        return result.ravel()
+
     def turn(self, state, q: np.ndarray) -> None:
         """Rotate the bodies of a coupled state by the rotation vectors in dofs q (size,)."""
         from scipy.spatial.transform import Rotation

@@ -56,8 +56,7 @@ class CoupledTangent(TangentBlock):
         return forces, blocks, islands
 
     def loads(self, factor: float, q: np.ndarray) -> np.ndarray:
-        result = self.nodal_loads(factor, q)
-        return self.carried.condense(q, result) if self.carried else result
+        return self._condensed(q, self.nodal_loads(factor, q))
 
     def nodal_loads(self, factor: float, q: np.ndarray) -> np.ndarray:
         """Return external forces (size,), of carried nodes on the nodes themselves."""
@@ -104,8 +103,8 @@ class CoupledTangent(TangentBlock):
             dofs = 3 * _tiled(part.host.slots, self.host.blocks, self.coupled.worlds)[slot].T + component
             entries.append((dofs[:, None, :] * self.size + dofs[:, :, None]).ravel())
             local.append(to_local)
-        pattern, places = np.unique(np.concatenate(entries), return_inverse=True)
-        places = np.split(places, np.cumsum([len(e) for e in entries])[:-1])
+        pattern, places = np.unique(np.concatenate([np.zeros(0, int), *entries]), return_inverse=True)
+        places = np.split(places, np.cumsum([len(e) for e in entries]))[:-1]
         columns, rows = np.divmod(pattern, self.size)
         return list(zip(local, places, strict=True)), rows, np.searchsorted(columns, np.arange(self.size + 1))
 
@@ -125,12 +124,24 @@ class CoupledTangent(TangentBlock):
         if not self.model.touch:
             return elastic
         self.model.touch.evaluate(state.coupled.q, state.coupled.rate)
-        return elastic - self.into(self.model.touch.terms.forces.numpy().astype(np.float64).ravel())
+        return elastic - self._condensed(self.dofs(state), self._contact_forces())
+
+    def friction(self, state) -> np.ndarray:
+        """Return friction forces by `state.slip_velocity` (size,) [N, N m]."""
+        forces = self.model.touch.friction(state.coupled.q, state.slip_velocity, state.coupled.rate)
+        return self._condensed(self.dofs(state), self.into(forces.ravel()))
+
+    def _contact_forces(self) -> np.ndarray:
+        """Return the contact forces of the last evaluation (size,), of carried nodes on the nodes themselves."""
+        return self.into(self.model.touch.terms.forces.numpy().astype(np.float64).ravel())
+
+    def _condensed(self, q: np.ndarray, forces: np.ndarray) -> np.ndarray:
+        """Return forces (size,) with the forces on carried nodes moved to the rigid bodies."""
+        return self.carried.condense(q, forces) if self.carried else forces
 
     def elastic_gradient(self, state) -> np.ndarray:
         """Return the energy gradient without contact."""
-        result = self._nodal_gradient(state)
-        return self.carried.condense(self.dofs(state), result) if self.carried else result
+        return self._condensed(self.dofs(state), self._nodal_gradient(state))
 
     def _nodal_gradient(self, state) -> np.ndarray:
         result = np.zeros((self.size // 3, 3))
@@ -185,8 +196,10 @@ class CoupledTangent(TangentBlock):
             self.model.touch.evaluate(state.coupled.q, state.coupled.rate)
             elastic = elastic + exact_hessian.hessian(self.model.touch.terms, state.coupled.q)
         if self.carried:
-            q = self.dofs(state)
-            elastic = self.carried.matrix(q, elastic) + self.carried.geometric(q, self._nodal_gradient(state))
+            q, gradient = self.dofs(state), self._nodal_gradient(state)
+            if self.model.touch:
+                gradient -= self._contact_forces()
+            elastic = self.carried.matrix(q, elastic) + self.carried.geometric(q, gradient)
         return self.matrix(elastic)
 
     def linear_stress(self, state, step: np.ndarray) -> list:

@@ -24,6 +24,7 @@ from ddg_warp.solve.linear.sparse_direct import Factorisation, SingularError
 
 HALVINGS = 30  # Limit of step halvings.
 STALLED = 8  # Steps without halved residuals that end a search below energy rounding.
+SHORTER = 0.9  # Largest fraction left by a cut of a step that rotates rigid bodies.
 CUT = 0.25  # Accepted fraction of a step below which rises begin.
 RISES = 8  # Steps that may raise the energy before the search returns to the best state.
 BOLD = 5  # Rises after which steps shorten, to recover the stretching energy.
@@ -295,11 +296,15 @@ class Search:
 
     def _move(self, step: np.ndarray, taken: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return dofs after a step limited by CCD, and the fractions `taken` times the CCD step fraction."""
-        moved = self.tangent.retract(self.current.q, step)
-        if not self.tangent.model.touch:
-            return moved, taken
-        share = self.owner.coupled.share(self.current.q, moved)
-        return self.current.q + share * (moved - self.current.q), share * taken
+        for _ in range(HALVINGS):
+            moved = self.tangent.retract(self.current.q, step)
+            if not self.tangent.model.touch:
+                return moved, taken
+            share = self.owner.coupled.share(self.current.q, moved)
+            if share == 1.0 or not self.tangent.carries:
+                return self.current.q + share * (moved - self.current.q), share * taken
+            step, taken = SHORTER * share * step, SHORTER * share * taken  # rigid bodies end on their arcs
+        return self.current.q, 0.0 * taken
 
 
 class Rises:

@@ -65,6 +65,8 @@ class StaticNewton(CoupledNewton):
         self._base_force, self._before = wp.zeros_like(self.loading.force), wp.zeros_like(self.iterates.q)
         self.islands.substep_accepted.fill_(1)
         self._follow, self._less, self._far = coupled_newton.static_kernels(self.coupled.real, self.linear)
+        if self.contact and self.rigid_bodies:
+            self.rigid_bodies.resist()
         self.has_friction = self.contact is not None and self.contact.has_friction
         if self.has_friction:  # not the rate of strain-rate damping, which acts at rest
             self.contact.rate = wp.zeros_like(self.islands.inverse_step)
@@ -84,11 +86,12 @@ class StaticNewton(CoupledNewton):
         before: np.ndarray | None = None,
         slid: np.ndarray | None = None,
         rate: float = 0.0,
+        rotation: wp.array | None = None,
     ) -> None:
         """Start from dofs `q` under dead loads (worlds, 3 blocks) and follower loads at `load_factor`, given load scales of bodies.
 
         In contact, q is the proposed motion from dofs `before`. Friction counts slips from blocks `slid` over `rate`; zero means no
-        friction.
+        friction. Rotations of rigid bodies count from orientations `rotation`.
         """
         for name in (
             "status",
@@ -109,6 +112,9 @@ class StaticNewton(CoupledNewton):
             self.contact.rate.fill_(rate)
             if slid is not None:
                 self.slid.assign(slid)
+        if self.rigid_bodies:
+            dead = dead.reshape(self.coupled.worlds, -1, 3).copy()
+            self.rigid_bodies.begin_statics(rotation, dead)
         for force in (self.loading.force, self._base_force):
             force.assign(dead.reshape(-1, 3))
         if self.user_forces:
@@ -134,6 +140,8 @@ class StaticNewton(CoupledNewton):
         """Solve from the start of `begin`, with the lagged data of `state`. With `again`, slips continue. Can be captured."""
         if self.contact:
             self.contact.renew(self._before)
+            if self.rigid_bodies:
+                self.rigid_bodies.place(self.iterates, self.islands)
             self.contact.place(self.iterates, self.system, self.islands)
             self.contact.lag(self._before, again)
             if self.has_friction:
@@ -230,6 +238,7 @@ class CoupledEquilibrium:
                 psd="progressive" if contact_parameters or model.coupled.user_forces else "gauss_newton",
             ),
         )
+        self._carried = self.tangent.parts[-1].carried
         self.arcs = Arcs(model) if contact_parameters and model.motions else None
         self._rest = self.tangent.dofs(model.state())
         self._size = float(np.ptp(model.coupled.host.rest[: model.coupled.host.nodes], axis=0).max())
@@ -238,7 +247,7 @@ class CoupledEquilibrium:
         self._graphs = Graphs(model, lambda: device_arrays.load_kernels(self.newton.kernels, model.wp_device))
         self.wary = True
         self.polish = None
-        if self.newton.has_friction and not large_static(model):
+        if self.newton.has_friction and not large_static(model) and not self._carried:
             self.polish = FrictionNewton(model, owner.residuals, self.share, self.newton.contact.search.search_distance)
         self._least, self._active_pairs, self._friction_work = math.inf, [], 0.0
 
@@ -367,6 +376,8 @@ class CoupledEquilibrium:
                 self._relax(relaxation, state, begun)
             for name in ("frame", *(f"lag_{i}" for i in range(len(self.coupled.sets)))):
                 wp.copy(state.coupled.arrays()[name], self._start.arrays()[name])  # the solve may have updated these
+            if self._carried:
+                self._carried.turn(state.coupled, state.coupled.q.numpy().astype(float).ravel())
             self.model.carry_frames(state)
             # Converged with the friction of its own normal forces; later solves move such a world within rounding.
             settled |= on and iterations <= np.where(ends == outcome.CONVERGED_TO_ROUNDING, POLISH, 0)
@@ -448,6 +459,8 @@ class CoupledEquilibrium:
             )
             turned = polyline.signed_angle(polyline.transport(u, t, end), v, end)
             q.reshape(coupled.worlds, -1, 3)[:, coupled.angle_start :][:, : coupled.edges, 0] -= turned
+        if self._carried:
+            q = self._carried.rotated(q.ravel(), first.coupled, state.coupled).reshape(-1, 3)
         return q
 
     def _refuse_drifting(self, state: State, q: np.ndarray, load_factor: float) -> None:
@@ -467,6 +480,8 @@ class CoupledEquilibrium:
         factor = relaxation(displacement, (displacement * fixed).any(1))
         if (factor < 1.0).any():
             relaxed = begun + (factor[:, None] * displacement).reshape(begun.shape)
+            if self._carried:
+                relaxed = self._carried.place(begun.astype(float).ravel(), relaxed.ravel()).reshape(begun.shape)
             if self.newton.contact.limit.fraction(begun, relaxed) == 1.0:
                 state.coupled.q.assign(relaxed)
 
@@ -496,10 +511,19 @@ class CoupledEquilibrium:
         tangent, tangent_block = self.tangent, self.tangent.parts[-1]
         q = tangent.dofs(state)
         start = q if before is None else self._beside(q, tangent.dofs(before))
+        if self._carried and before is not None:
+            start = self._carried.rotated(start, before.coupled, state.coupled)
         outer, gradient = tangent.loads(load_factor, q), tangent_block.elastic_gradient(state)
         scale = self.owner.residuals.load_scale(outer, gradient)
         self.newton.begin(
-            tangent.back(q), tangent_block.dead_loads(load_factor), load_factor, scale, tangent.back(start), slid, rate
+            tangent.back(q),
+            tangent_block.dead_loads(load_factor),
+            load_factor,
+            scale,
+            tangent.back(start),
+            slid,
+            rate,
+            state.coupled.rotation,
         )
         for name, array in self._start.arrays().items():
             wp.copy(array, state.coupled.arrays()[name])

@@ -29,7 +29,6 @@ from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.model import validate
 from ddg_warp.model.controls import Controls, checked
 from ddg_warp.model.model import Model, check_model
-from ddg_warp.model.rigid_bodies import refuse_rigid_bodies
 from ddg_warp.model.state import State, check_state
 from ddg_warp.progress import Heartbeat
 from ddg_warp.scene import validate as scene_validate
@@ -172,8 +171,6 @@ class Equilibrium:
 
     def __init__(self, model: Model, options: StaticsOptions | None = None):
         self.model, self.options = model, options or StaticsOptions()
-        if model.touch:
-            refuse_rigid_bodies("statics with contact", model)
         self.tangent = Tangent(model)
         rounding = self.options.floor_factor * model.types.eps
         self.residuals = Residuals(self.tangent, self.options.rtol, rounding)

@@ -32,8 +32,8 @@ def require_supports(model) -> None:
         loose = np.flatnonzero(~host.holds[spatial].any(0)) if spatial.size else spatial
         if loose.size:
             raise SceneError(
-                f"no node of the shells and joined rods is supported along {'xyz'[loose[0]]}: a static solve needs supports; "
-                "add scene.hold(...), scene.clamp_boundary(...) or scene.fix(...)"
+                f"no node of the shells{', rigid bodies' * bool(model.scene.bodies)} and joined rods is supported along "
+                f"{'xyz'[loose[0]]}: a static solve needs supports; add scene.hold(...), scene.clamp_boundary(...) or scene.fix(...)"
             )
 
 

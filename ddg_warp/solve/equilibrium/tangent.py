@@ -170,10 +170,7 @@ class Tangent:
         """Return friction forces by `state.slip_velocity` (size,) [N], which are not in the gradient; zero without friction."""
         result, touch = np.zeros(self.size), self.model.touch
         if touch and touch.terms.frictions:
-            coupled = self.parts[-1]
-            self.of(coupled, result)[:] = coupled.into(
-                touch.friction(state.coupled.q, state.slip_velocity, state.coupled.rate).ravel()
-            )
+            self.of(self.parts[-1], result)[:] = self.parts[-1].friction(state)
         return result
 
     @property

@@ -87,8 +87,6 @@ def why_not_pcg(model) -> str:
     """Return the reason against equilibria by conjugate gradients; empty without."""
     if model.coupled is None or model.groups:
         return "it is for shells and joined rods only, and the model has uncoupled rods"
-    if model.scene.bodies:
-        return "it is for scenes without rigid bodies"
     return ""
 
 

@@ -102,7 +102,7 @@ class NewtonContact:
         """
         if self.has_friction:
             self.terms.lag(x, again, rate)
-            if self.rigid_bodies and not again:
+            if self.rigid_bodies and rotation is not None:
                 self.rigid_bodies.begin_slip(rotation, self.terms.start)
 
     def lag_again(self, solution: wp.array, iterates, islands) -> None:

@@ -7,6 +7,8 @@ from ddg_warp.kernels.rigid_bodies import condensation, motion
 from ddg_warp.solve.collision.support_arcs import PART
 from ddg_warp.timers import timer
 
+FREE = 1e-9  # stiffness of free motions in equilibria with contact, over the least contact stiffness
+
 
 class RigidBodies:
     """Rigid bodies of a `CoupledNewton`: flight, carried nodes, residuals and the matrix.
@@ -22,6 +24,7 @@ class RigidBodies:
         longest: largest rotation of each body in one motion that contact limits (B,) [rad].
         cross: blocks of contact between origin and rotation of bodies, at blocks of rotations (W N,); empty without contact.
         least: least fraction of the motion of each world after `bound_rotations` (worlds,).
+        shift: added to the diagonal of the matrix (N,); empty in time steps.
         bodies: struct of kernels, with y and D of carried nodes and the inertia of rotations.
     """
 
@@ -54,6 +57,7 @@ class RigidBodies:
         self._factors = wp.zeros((3, worlds * bodies), dtype=M, device=device)
         self._factorise, self._apply = condensation.preconditioner_kernels(linear)
         self._gather, self._condense_diagonal, self._condense_product = condensation.contact_kernels(real, linear)
+        self.shift = wp.zeros(0, dtype=linear, device=device)
         self._condense = condensation.condense_kernel(real, linear, inertia_structs, not coupled.sets)
 
     @property
@@ -70,6 +74,21 @@ class RigidBodies:
             self._apply,
             *(contact if self._touches else []),
         ]
+
+    def resist(self) -> None:
+        """Add a small stiffness to the matrix, against motions that contact leaves free and rounding would drive."""
+        host, shift = self.coupled.host, np.zeros(self.coupled.blocks)
+        rigid, stiffness = self.tables.host, host.contact_parameters.stiffness
+        shift[rigid.origins] = FREE * stiffness[stiffness > 0.0].min()
+        shift[rigid.spins] = shift[rigid.origins] * rigid.lengths(host.mass) ** 2
+        self.shift = wp.array(shift, dtype=self.shift.dtype, device=self.coupled.device)
+
+    def begin_statics(self, rotation: wp.array, loads: np.ndarray) -> None:
+        """Count rotations from orientations (W B,), without inertia, and take moments on bodies out of loads (worlds, N, 3)."""
+        wp.copy(self.predicted, rotation)
+        spins = self.tables.host.spins
+        self.bodies.moment.assign(np.ascontiguousarray(loads[:, spins].reshape(-1, 3)))
+        loads[:, spins] = 0.0
 
     def place(self, iterates, islands) -> None:
         """Move carried nodes to the iterate."""
@@ -148,7 +167,7 @@ class RigidBodies:
             self.bodies,
             *(lists[n] for n in ("targets", "rows", "turning", "starts", "sources", "left", "right")),
         ]
-        inputs += [self.sparsity.positions, *islands.arrays]
+        inputs += [self.sparsity.positions, self.shift, *islands.arrays]
         self._launch(self._condense, len(lists["targets"]), inputs, [matrix])
 
     @property
