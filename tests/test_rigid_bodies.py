@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 import ddg_warp as ddg
 from ddg_warp import stability
@@ -429,6 +430,21 @@ def test_equilibria_of_bodies_on_rods():
         reached = integrator.step(reached, 0.03)
     assert np.abs(reached.points() - state.points()).max() < 1e-6 * LENGTH
     assert damped.energies(reached)["gravity"] == pytest.approx(model.energies(state)["gravity"], rel=1e-5)
+
+
+def test_column_with_a_rigid_head_buckles():
+    """A clamped column of length L under a weight at the distance a above its end buckles at k L tan(k L) = L / a, P = EI k^2."""
+    arm, stiffness = 0.1, YOUNG * np.pi * RADIUS**4 / 4
+    k = brentq(lambda x: x * np.tan(x) - LENGTH / arm, 1e-6, 0.5 * np.pi - 1e-9) / LENGTH
+    critical = stiffness * k**2
+    scene = ddg.Scene(gravity=(-0.05 * critical / 0.02, 0, 0))
+    rod = reference_rod(scene)
+    scene.clamp_end(rod, "first")
+    head = scene.add_body(ddg.Box((LENGTH + arm, 0, 0), (arm, 0.01, 0.01)), mass=0.02)
+    scene.attach(rod, [-1], head)
+    model = scene.build(device=DEVICE, precision="float64")
+    loaded = ddg.statics.solve(model)
+    assert stability.buckling(model, ddg.statics.solve(model, end=1e-6), loaded) == pytest.approx(20.0, rel=1e-3)
 
 
 def test_stability_of_a_pinned_body():

@@ -8,7 +8,7 @@ from ddg_warp.capture_lock import launches
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.kernels.collision.contact.query import closest_kernel
 from ddg_warp.model import rod_shell_coupling
-from ddg_warp.model.rigid_bodies import refuse_rigid_bodies
+from ddg_warp.solve.equilibrium.carried_dofs import CarriedDofs
 
 ROUNDS = 1000
 PART = 0.1  # default gap over the smallest activation distance
@@ -19,9 +19,9 @@ BEYOND = 1.02  # gap that pairs are moved to over the required one, for few roun
 def resolve_overlaps(model, state, gap: float | None = None):
     """Return a copy of a state, with nodes moved until no two surfaces are closer than a gap.
 
-    Each round moves close pairs apart along the line between their closest points, by least squares. Fixed dofs stay. Crossing rods
-    pass by each other then; entangled ones stay entangled. Velocities stay, frames are transported. Lengths may change: check the
-    returned distance.
+    Each round moves close pairs apart along the line between their closest points, by least squares. Fixed dofs stay, and rigid bodies
+    move as such. Crossing rods pass by each other then; entangled ones stay entangled. Velocities stay, frames are transported.
+    Lengths may change: check the returned distance.
 
     Args:
         gap: smallest surface distance [m]; by default a tenth of the smallest activation distance.
@@ -33,7 +33,6 @@ def resolve_overlaps(model, state, gap: float | None = None):
         SceneError: the scene has no contact, or the gap exceeds the activation distance.
         SolverError: pairs cannot be separated; the message names the closest.
     """
-    refuse_rigid_bodies("resolve_overlaps", model)
     touch = model.touch
     if touch is None:
         raise SceneError("resolve_overlaps: this scene has no contact; add scene.contact()")
@@ -50,15 +49,17 @@ def resolve_overlaps(model, state, gap: float | None = None):
     new = state.copy()
     start = new.coupled.q.numpy().reshape(-1, 3).astype(float)
     x, free = start.copy(), np.tile(~host.fixed.astype(bool), (model.worlds, 1)).astype(float)
+    bodies = _Bodies(host, model.worlds, free) if host.rigid_bodies else None
     for _ in range(ROUNDS):
         new.coupled.q.assign(x)
         touch.find(new.coupled.q)
         steps, weights, closest = np.zeros_like(x), np.zeros(len(x)), np.inf
         for pairs in touch.search.lists:
-            closest = min(closest, _separate(pairs, new.coupled.q, free, least, steps, weights))
+            closest = min(closest, _separate(pairs, new.coupled.q, free, least, steps, weights, bodies))
         if closest >= least:
             break
-        x = x + steps / np.maximum(1.0, weights)[:, None]
+        steps /= np.maximum(1.0, weights)[:, None]
+        x = bodies.moved(x, steps, new.coupled) if bodies else x + steps
     else:
         gap, pair = touch.closest(new.coupled.q)
         raise SolverError(
@@ -67,15 +68,70 @@ def resolve_overlaps(model, state, gap: float | None = None):
             "one of their supports, or give them a smaller radius",
             outcome="no_room",
         )
-    moved = float(np.linalg.norm(x - start, axis=1).max(initial=0.0))
+    moved = float(np.linalg.norm(x - start, axis=1).reshape(model.worlds, -1)[:, : host.nodes].max(initial=0.0))
     if moved > 0.0:
+        if bodies:
+            new.coupled.q.assign(bodies.carried.rotated(x, new.coupled, state.coupled).reshape(-1, 3))
         model.carry_frames(new)
+        if bodies:
+            coupled.bodies.carry(new.coupled)
         rod_shell_coupling.follow(coupled, new.coupled, angles=True, rates=False)
         model.update_strains(new)
     return new, moved
 
 
-def _separate(pairs, x: wp.array, free: np.ndarray, least: float, steps: np.ndarray, weight_sums: np.ndarray) -> float:
+class _Bodies:
+    """Rigid bodies of all worlds, which pairs move by the nodes that they carry.
+
+    Args:
+        free: free dofs of blocks, 1 or 0 (W N, 3).
+    """
+
+    def __init__(self, host, worlds: int, free: np.ndarray):
+        rigid, shift, self._free = host.rigid_bodies, host.blocks * np.arange(worlds)[:, None], free
+        self.carried = CarriedDofs(host, worlds)
+        self._blocks = np.stack([(shift + blocks).ravel() for blocks in (rigid.origins, rigid.spins)])
+        self._length = np.tile(rigid.lengths(host.mass), worlds)
+        self._owner = np.full(worlds * host.blocks, -1)
+        self._owner[(shift + rigid.carried).ravel()] = (len(rigid) * np.arange(worlds)[:, None] + rigid.owner).ravel()
+
+    def rates(self, x: np.ndarray, nodes: np.ndarray, weights: np.ndarray, n: np.ndarray) -> tuple:
+        """Return by body of a pair: the pair, the two blocks, and rates of the gap by translation and by rotation times a length.
+
+        Args:
+            x: positions (W N, 3) [m]. nodes, weights: of pairs (n, 4). n: directions (n, 3).
+        """
+        pair, local = np.nonzero((self._owner[nodes] >= 0) & (weights != 0.0))
+        body, node = self._owner[nodes[pair, local]], nodes[pair, local]
+        keys, index = np.unique(pair * len(self._length) + body, return_inverse=True)
+        pair_of, body_of = np.divmod(keys, len(self._length))
+        rates = np.zeros((2, len(keys), 3))
+        push = weights[pair, local, None] * n[pair]
+        arms = (x[node] - x[self._blocks[0, body]]) / self._length[body, None]
+        np.add.at(rates[0], index, push)
+        np.add.at(rates[1], index, np.cross(arms, push))
+        blocks = self._blocks[:, body_of]
+        return pair_of, blocks, rates * self._free[blocks], self._length[body_of]
+
+    def moved(self, x: np.ndarray, steps: np.ndarray, state) -> np.ndarray:
+        """Return positions after `steps` (W N, 3) with translations and rotation vectors of bodies, which the state takes over."""
+        step = x + steps
+        step[self._blocks[1]] = steps[self._blocks[1]]
+        self.carried.turn(state, step.ravel())
+        result = self.carried.place(x.ravel(), step.ravel()).reshape(-1, 3)
+        result[self._blocks[1]] = 0.0
+        return result
+
+
+def _separate(
+    pairs,
+    x: wp.array,
+    free: np.ndarray,
+    least: float,
+    steps: np.ndarray,
+    weight_sums: np.ndarray,
+    bodies: _Bodies | None,
+) -> float:
     """Add separating displacements of a pair list to `steps` and weights to `weight_sums`; return the smallest gap."""
     count = int(pairs.count.numpy()[0])
     if not count:
@@ -93,9 +149,16 @@ def _separate(pairs, x: wp.array, free: np.ndarray, least: float, steps: np.ndar
         n = _directions(distance[near], length[near], x.numpy()[nodes], pairs.kind.endless)
         movable = free[nodes] * n[:, None]  # (pairs, nodes, 3), direction on free dofs
         mobility = (weights**2 * (movable * n[:, None]).sum(2)).sum(1)
+        if bodies:
+            pair, blocks, rates, length = bodies.rates(x.numpy().astype(float), nodes, weights, n)
+            np.add.at(mobility, pair, (rates**2).sum((0, 2)))
         size = np.where(mobility > 0.0, (BEYOND * least - gap[near]) / np.where(mobility > 0.0, mobility, 1.0), 0.0)
         np.add.at(steps, nodes, (size[:, None] * weights)[..., None] * movable)
         np.add.at(weight_sums, nodes, np.abs(weights) * (mobility > 0.0)[:, None])
+        if bodies:
+            rates[1] /= length[:, None]
+            np.add.at(steps, blocks, size[pair, None] * rates)
+            np.add.at(weight_sums, blocks, np.ones(blocks.shape))
     return float(gap.min())
 
 

@@ -83,6 +83,35 @@ def test_heap_is_separated(device, precision):
     assert np.isfinite(after.points()).all()
 
 
+def test_bodies_move_rigidly(device):
+    """Stacked boxes, a ball and a rod with a body separate. Nodes stay where bodies carry the rod, and steps continue."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0))
+    half, material = (0.02, 0.03, 0.025), {"density": 1000.0}
+    scene.add_body(ddg.Box((0.0, 0.0, 0.02), half, radius=RADIUS), **material, name="lower")
+    scene.add_body(ddg.Box((0.01, 0.005, 0.065), half, radius=RADIUS), **material, angular_velocity=(0.0, 0.0, 2.0))
+    scene.add_body(ddg.Sphere((0.03, 0.0, 0.1), 0.02), **material, name="ball")
+    points = np.linspace((-0.1, 0.0, 0.09), (0.1, 0.0, 0.09), 21)
+    rod = scene.add_rod(points, section=ddg.Circle(radius=RADIUS), material=MATERIAL)
+    scene.attach(rod, -1, scene.add_body(ddg.Box((0.11, 0.0, 0.09), (0.01,) * 3, radius=1e-3), **material, name="head"))
+    scene.add_obstacle(ddg.Plane())
+    scene.contact(range=RANGE)
+    model = scene.build(device=device, precision="float64")
+    state = model.state()
+    new, moved = model.resolve_overlaps(state)
+    assert 2.0 * RADIUS < moved < 10.0 * RADIUS
+    assert model.contacts(new).gap.min() >= PART * RANGE
+    bodies, q = model.coupled.host.rigid_bodies, new.coupled.q.numpy()
+    rotations = new.coupled.rotation.numpy()
+    arms = np.einsum("nij,nj->ni", rotations[bodies.owner], bodies.arms)
+    assert np.abs(q[bodies.carried] - q[bodies.origins[bodies.owner]] - arms).max() < 1e-15
+    assert np.abs(rotations[0] - state.coupled.rotation.numpy()[0]).max() > 1e-3
+    assert np.abs(new.points(rod)[-1] - new.body("head").position - [-0.01, 0.0, 0.0]).max() < 1e-3
+    spun = new.body(1)
+    assert spun.angular_velocity == pytest.approx([0.0, 0.0, 2.0], abs=1e-2)
+    after = ddg.Integrator(model).step(new, 1e-4)
+    assert np.isfinite(after.points()).all()
+
+
 def test_refusals(device):
     scene = rods_through_origin((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
     for rod in range(2):

@@ -15,7 +15,6 @@ from ddg_warp import argument_checks
 from ddg_warp.compile.precision import lost_in_rounding
 from ddg_warp.errors import SceneError
 from ddg_warp.model.model import Model, check_model
-from ddg_warp.model.rigid_bodies import refuse_rigid_bodies
 from ddg_warp.model.state import State, query
 from ddg_warp.solve.equilibrium.rigid_modes import rigid_modes
 from ddg_warp.solve.equilibrium.tangent import Tangent
@@ -366,7 +365,6 @@ def buckling(model: Model, free: State, loaded: State, count: int = 1) -> Floats
     for state in (loaded, free):
         query("buckling", model, state)
     argument_checks.count("buckling: count", count)
-    refuse_rigid_bodies("buckling", model)
     tangent = Tangent(model)
     dofs = np.flatnonzero(tangent.free)
     whole = tangent.stiffness(free)
