@@ -64,10 +64,11 @@ def test_rods_in_closed_form(device, name, worlds):
         if "bend" not in KINDS[name]:
             size = np.hypot(mine["curvature_1"], np.nan_to_num(mine["curvature_2"]))
             np.testing.assert_allclose(size, kappa, rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(mine["bending_moment"], EI * kappa, rtol=1e-9, atol=1e-9)
         energy = 0.5 * EA * (STRETCH - 1.0) ** 2 + 0.5 * EI * kappa**2
         np.testing.assert_allclose(mine["energy_density"], energy, rtol=1e-9)
         twisting = "twist" not in KINDS[name] and "bend" not in KINDS[name] and "dimension" not in KINDS[name]
-        assert np.isfinite(mine["twist"]).all() == twisting
+        assert np.isfinite(mine["twist"]).all() == np.isfinite(mine["torque"]).all() == twisting
 
 
 def test_twist_in_closed_form(device):
@@ -79,8 +80,10 @@ def test_twist_in_closed_form(device):
     scene.clamp_end(rod, "first")
     scene.clamp_end(rod, "last", motion=ddg.Motion(angle=lambda t: 0.6 * t, axis=(1.0, 0.0, 0.0)))
     model = scene.build(device, "float64")
-    twist = point_fields(model, statics.solve(model), ["twist"])["twist"]
-    np.testing.assert_allclose(twist, 0.3, rtol=1e-9)
+    fields = point_fields(model, statics.solve(model), ["twist", "torque", "bending_moment"])
+    np.testing.assert_allclose(fields["twist"], 0.3, rtol=1e-9)
+    np.testing.assert_allclose(fields["torque"], 0.3 * GJ, rtol=1e-9)
+    np.testing.assert_allclose(fields["bending_moment"], 0.0, atol=1e-9)
 
 
 def mixed(device, worlds: int = 1):
@@ -97,17 +100,18 @@ def mixed(device, worlds: int = 1):
 def test_recorded_fields_are_read_back(tmp_path, device, worlds):
     """Fields at points and triangles; Green's strain of the sheet is (s^2 - 1) / 2, its energy per area E h times the square / 2."""
     model, state = mixed(device, worlds)
-    names = ["axial_force", "energy_density", "shell_strain", "shell_energy"]
+    names = ["axial_force", "energy_density", "shell_strain", "shell_energy", "shell_stress"]
     with Recorder(model, tmp_path, fields=names) as recorder:
         recorder.record(state)
     with TrajectoryReader(tmp_path / "trajectory.vtkhdf") as reader:
         force, strain = reader.fields["axial_force"][0].reshape(worlds, -1), reader.fields["shell_strain"][0]
-        energy = reader.fields["shell_energy"][0]
+        energy, stress = (reader.fields[name][0][worlds:] for name in ("shell_energy", "shell_stress"))
     np.testing.assert_allclose(force[:, :5], EA * (STRETCH - 1.0), rtol=1e-9)
     assert np.isnan(force[:, 5:]).all() and np.isnan(strain[:worlds]).all()
     green = 0.5 * (STRETCH**2 - 1.0)
     np.testing.assert_allclose(strain[worlds:], green, rtol=1e-9)
-    np.testing.assert_allclose(energy[worlds:], 0.5 * 1e6 * 1e-2 * green**2, rtol=1e-9)
+    np.testing.assert_allclose(stress, 1e6 * green, rtol=1e-9)  # uniaxial, Poisson's ratio 0
+    np.testing.assert_allclose(energy, 0.5 * 1e6 * 1e-2 * green**2, rtol=1e-9)
     shown_in_usd(tmp_path / "scene.usdc", green)
 
 

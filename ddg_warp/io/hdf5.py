@@ -241,7 +241,7 @@ class TrajectoryWriter:
             if self.contacts:
                 extend_contacts(trajectory["contacts"], [frame["contacts"] for frame in self._frames], self._block)
             self._extend_series(trajectory)
-            write_view(file, self._shapes)
+            write_view(file, self._shapes, self._model.obstacles, self._model.rigid_bodies)
             checkpoint = file.require_group(f"checkpoint/{slot}")
             checkpoint.attrs["frame"] = len(trajectory["time"])
             for name in paths_of(checkpoint) - self._snapshot.keys():
@@ -306,7 +306,7 @@ class TrajectoryWriter:
                 trajectory[name].resize(frame, axis=0)
             if self.contacts:
                 cut_contacts(trajectory["contacts"], frame)
-            write_view(file, self._shapes)
+            write_view(file, self._shapes, self._model.obstacles, self._model.rigid_bodies)
 
 
 @contextmanager

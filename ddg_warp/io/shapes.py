@@ -93,3 +93,29 @@ class Shapes:
         rows = np.arange(rod_points) + point_count * np.arange(worlds)[:, None]
         tiled = None if surfaces is None else Surfaces.tiled(surfaces, worlds, point_count)
         return cls(Curves.tiled(curves, worlds), rows.ravel(), tiled, point_count, worlds)
+
+    @property
+    def curves_of_a_world(self) -> Curves:
+        """Rods of the first world."""
+        count = len(self.curves.counts) // self.worlds
+        points = int(self.curves.counts[:count].sum())
+        values = {each.name: getattr(self.curves, each.name)[:count] for each in fields(Curves)}
+        return Curves(**(values | {"radius": self.curves.radius[:points]}))
+
+
+def directors_at_points(curves, directors: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Return the director (worlds P, 3) of the edge that begins at each point; 0 at points of surfaces.
+
+    The last point of an open rod has the director of the last edge.
+
+    Args:
+        directors: of edges (worlds, edges, 3).
+        shape: (worlds, P).
+    """
+    edges = curves.counts - ~curves.closed
+    starts = np.repeat(np.cumsum(edges) - edges, curves.counts)
+    along = np.arange(curves.counts.sum()) - np.repeat(np.cumsum(curves.counts) - curves.counts, curves.counts)
+    edge = starts + np.minimum(along, np.repeat(edges, curves.counts) - 1)
+    out = np.zeros((*shape, 3))
+    out[:, : len(edge)] = directors.reshape(shape[0], -1, 3)[:, edge]
+    return out.reshape(-1, 3)

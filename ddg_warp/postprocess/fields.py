@@ -16,12 +16,15 @@ POINT_FIELDS = {
     "curvature_1": "curvature of rods about their first director [1/m]; of rods without twist its size",
     "curvature_2": "curvature of rods about their second director [1/m]",
     "twist": "twist of rods per length [1/m]",
+    "bending_moment": "size of the bending moment of rods [N m]",
+    "torque": "torque of rods about their tangent [N m]",
     "energy_density": "elastic energy of rods per length [J/m]",
 }
 CELL_FIELDS = {
     "shell_strain": "principal strain of triangles, the largest in magnitude",
     "shell_curvature": "principal change of curvature of triangles, the largest in magnitude [1/m]",
     "shell_energy": "elastic energy of triangles per area [J/m^2]",
+    "shell_stress": "equivalent stress of von Mises of triangles, the larger one of both surfaces [Pa]",
 }
 
 
@@ -52,7 +55,10 @@ def point_fields(model, state, names: Sequence[str]) -> dict[str, np.ndarray]:
     if "energy_density" in names:
         _need_quadratic(model)
     for term, strains, stresses, energy, rows in _elements(model, state):
-        values = {"axial_force": stresses[..., 0]} if term.measure.span == 1 else _curvatures(term, strains)
+        stretched = term.measure.span == 1
+        values = (
+            {"axial_force": stresses[..., 0]} if stretched else _curvatures(term, strains) | _moments(term, stresses)
+        )
         values["energy_density"] = energy
         mine = {name: [np.zeros_like(sums[name]) for _ in range(2)] for name in values}
         for index in rows:
@@ -81,9 +87,13 @@ def cell_fields(model, state, names: Sequence[str]) -> dict[str, np.ndarray]:
     _check("cell_fields", model, state, names, CELL_FIELDS)
     if not names:
         return {}
-    from ddg_warp.postprocess.quantities import triangle_fields
+    from ddg_warp.postprocess.quantities import stresses, triangle_fields
 
-    values = triangle_fields(model, state)
+    values = triangle_fields(model, state) if set(names) != {"shell_stress"} else {}
+    if "shell_stress" in names:
+        of_shells = stresses(model, state)
+        each = [of_shells.shell(k).von_mises for k in range(len(model.scene.shells))]
+        values["stress"] = np.concatenate(each, axis=-1).reshape(model.worlds, -1)
     return {name: values[name.removeprefix("shell_")] for name in names}
 
 
@@ -102,6 +112,12 @@ def _curvatures(term, strains: np.ndarray) -> dict[str, np.ndarray]:
         name: strains[..., i]
         for i, name in zip(range(strains.shape[-1]), ("curvature_1", "curvature_2", "twist"), strict=False)
     }
+
+
+def _moments(term, stresses: np.ndarray) -> dict[str, np.ndarray]:
+    if term.measure.vector or stresses.shape[-1] < 3:
+        return {"bending_moment": np.linalg.norm(stresses, axis=-1)}
+    return {"bending_moment": np.linalg.norm(stresses[..., :2], axis=-1), "torque": stresses[..., 2]}
 
 
 def _elements(model, state) -> Iterator[tuple]:
@@ -180,21 +196,3 @@ def _fill_along_rods(model, values: np.ndarray) -> None:
         if 0 < len(defined) < last - first:
             nearest = defined[np.abs(np.arange(last - first)[:, None] - defined).argmin(1)]
             rod[:] = rod[:, nearest]
-
-
-def directors_at_points(curves, directors: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return the director (worlds P, 3) of the edge that begins at each point; 0 at points of surfaces.
-
-    The last point of an open rod has the director of the last edge.
-
-    Args:
-        directors: of edges (worlds, edges, 3).
-        shape: (worlds, P).
-    """
-    edges = curves.counts - ~curves.closed
-    starts = np.repeat(np.cumsum(edges) - edges, curves.counts)
-    along = np.arange(curves.counts.sum()) - np.repeat(np.cumsum(curves.counts) - curves.counts, curves.counts)
-    edge = starts + np.minimum(along, np.repeat(edges, curves.counts) - 1)
-    out = np.zeros((*shape, 3))
-    out[:, : len(edge)] = directors.reshape(shape[0], -1, 3)[:, edge]
-    return out.reshape(-1, 3)

@@ -11,8 +11,8 @@ from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.io.contact_records import Contacts
 from ddg_warp.io.observed import checked_attributes, checked_notes, checked_observed
-from ddg_warp.io.shapes import Shapes
-from ddg_warp.postprocess.fields import CELL_FIELDS, POINT_FIELDS, check_fields, directors_at_points
+from ddg_warp.io.shapes import Shapes, directors_at_points
+from ddg_warp.postprocess.fields import CELL_FIELDS, POINT_FIELDS, check_fields
 from ddg_warp.run.run_directory import (
     FULL,
     SCENE,

@@ -150,3 +150,63 @@ def test_recording_contacts_without_contact_is_refused(device, tmp_path):
     model = scene(contact=False).build(device=device)
     with pytest.raises(ValueError, match=r"the model has no contact; add scene\.contact"):
         ddg.Recorder(model, tmp_path, contacts=True)
+
+
+def vtk_blocks(path, frame: int):
+    """Return the blocks of a VTKHDF collection at a frame by name, read by VTK."""
+    vtk = pytest.importorskip("vtk")
+    reader = vtk.vtkHDFReader()
+    reader.SetFileName(str(path))
+    reader.SetStep(frame)
+    reader.Update()
+    shown = reader.GetOutputDataObject(0)
+    names = [
+        shown.GetMetaData(k).Get(vtk.vtkCompositeDataSet.NAME()) for k in range(shown.GetNumberOfPartitionedDataSets())
+    ]
+    return {name: shown.GetPartition(k, 0) for k, name in enumerate(names)}
+
+
+def vtk_points(block) -> np.ndarray:
+    return np.array([block.GetPoint(k) for k in range(block.GetNumberOfPoints())]).reshape(-1, 3)
+
+
+def vtk_values(data, name: str) -> np.ndarray:
+    from vtk.util.numpy_support import vtk_to_numpy
+
+    return vtk_to_numpy(data.GetArray(name))
+
+
+@pytest.mark.parametrize("worlds", [1, 2])
+def test_vtk_reads_obstacles_contacts_and_directors_while_they_are_written(device, tmp_path, worlds):
+    """Every block of frames shows at once; a run that goes on adds to the same view."""
+    pytest.importorskip("vtk")
+    path = tmp_path / "trajectory.vtkhdf"
+    model = scene().build(device=device, worlds=worlds)
+    states = record(model, tmp_path, 3, DT, contacts=True, directors=True)
+    assert set(vtk_blocks(path, 3)) == {"elastic", "obstacles", "contacts"}
+    integrator, state = ddg.Integrator(model), states[-1]
+    with ddg.Recorder(model, tmp_path, block=1, resume=True, usd=False) as recorder:
+        for _ in range(3):
+            state = integrator.step(state, DT)
+            recorder.record(state)
+            states.append(state.copy())
+            shown = vtk_blocks(path, len(states) - 1)  # of the file that the recorder has open
+            np.testing.assert_allclose(vtk_points(shown["elastic"]), state.points().reshape(-1, 3), rtol=1e-15)
+    for frame, state in enumerate(states):
+        shown, nodes = vtk_blocks(path, frame), state.obstacle_points().reshape(worlds, -1, 3)
+        expected = [
+            model.obstacles.points(k, nodes[world, model.obstacles.rows(k)] if moved else None)
+            for k, moved in enumerate(model.obstacles.moved)
+            for world in range(worlds if moved else 1)
+        ]
+        np.testing.assert_allclose(vtk_points(shown["obstacles"]), np.concatenate(expected), atol=1e-6)
+        pairs = model.contacts(state)
+        assert shown["contacts"].GetNumberOfVerts() == len(pairs)
+        np.testing.assert_allclose(vtk_points(shown["contacts"]), pairs.point, rtol=1e-15)
+        if len(pairs):
+            np.testing.assert_allclose(vtk_values(shown["contacts"].GetPointData(), "force"), pairs.force, rtol=1e-15)
+        director = vtk_values(shown["elastic"].GetPointData(), "director").reshape(worlds, -1, 3)
+        np.testing.assert_allclose(director[:, :-1], state.directors().reshape(worlds, -1, 3), atol=1e-6)
+    assert {len(model.contacts(state)) > 0 for state in states} == {True, False}
+    numbers = vtk_values(shown["obstacles"].GetCellData(), "obstacle")
+    assert np.count_nonzero(numbers == 4) == len(HEAD[1]) and np.count_nonzero(numbers == 3) == 12 * worlds

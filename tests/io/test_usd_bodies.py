@@ -292,3 +292,14 @@ def build() -> ddg.Scene:
         assert validate(path) == []
         stage = Usd.Stage.Open(str(path))
         assert len(UsdGeom.Xform(stage.GetPrimAtPath("/World/body")).GetTimeSamples()) == 7
+
+
+def test_vtk_shows_shapes_of_bodies(device, tmp_path):
+    pytest.importorskip("vtk")
+    from test_obstacles import vtk_blocks, vtk_points
+
+    model, states = run(device, tmp_path, 3)
+    last = len(model.obstacles) - 1
+    shapes = model.obstacles.points(last, states[-1].obstacle_points()[model.obstacles.rows(last)])
+    shown = vtk_points(vtk_blocks(tmp_path / "trajectory.vtkhdf", 3)["obstacles"])
+    np.testing.assert_allclose(shown[-len(shapes) :], shapes, atol=1e-6)
