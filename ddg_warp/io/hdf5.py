@@ -7,7 +7,7 @@
                   obstacles; body_poses (F, N, 3, 4) or (F, B, N, 3, 4), see
                   `State.body_poses`; contacts/{world, objects, point, gap, force, friction} (n, ...) if wanted, pairs of all frames
                   one after the other, up to contacts/ends[f] for frame f
-    /model        curves/{counts, closed, radius, names, batch}, surfaces/{triangles, first, names, thickness} if there are
+    /model        curves/{counts, closed, radius, names, batch}, surfaces/{triangles, first, names, thickness, uv} if there are
                   any, obstacles/{...}, see `Obstacles`, rigid_bodies/{names, mass, ...}, see `Bodies`,
                   touching/{names, size, force}, see `ContactScales`, parameters/NAME, attributes/NAME of rods
     /control      options of the run
@@ -360,7 +360,8 @@ def _other(reader: TrajectoryReader, model) -> tuple[str, str] | None:
 
 
 def _equal(recorded, wanted) -> bool:
-    return np.array_equal(np.asarray(recorded), np.asarray(wanted))
+    recorded, wanted = np.asarray(recorded), np.asarray(wanted)
+    return np.array_equal(recorded, wanted, equal_nan=recorded.dtype.kind == wanted.dtype.kind == "f")
 
 
 def _obstacle_nodes(model) -> int:

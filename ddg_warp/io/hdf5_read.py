@@ -26,7 +26,7 @@ from ddg_warp.io.shapes import Curves, Surfaces
 from ddg_warp.typing import Array, Bools, FilePath, Floats, Integers
 
 CURVE_FIELDS = ("counts", "closed", "radius", "names", "batch")
-SURFACE_FIELDS = ("triangles", "first", "names", "thickness")
+SURFACE_FIELDS = ("triangles", "first", "names", "thickness", "uv")
 COUNTS = "run"  # group of a checkpoint: counts of the run up to the frame
 FRAMES = ("points", "velocities", "directors", "obstacle_points", "body_poses")
 
@@ -350,7 +350,10 @@ class TrajectoryReader:
         self.curves = Curves(**{name: _array(model["curves"][name]) for name in CURVE_FIELDS})
         self.surfaces = None
         if "surfaces" in model:
-            self.surfaces = Surfaces(**{name: _array(model["surfaces"][name]) for name in SURFACE_FIELDS})
+            group = model["surfaces"]
+            self.surfaces = Surfaces(
+                **{name: _array(group[name]) for name in SURFACE_FIELDS if name != "uv" or "uv" in group}
+            )
         self.obstacles, self.obstacle_points = None, fields.get("obstacle_points")
         self.rigid_bodies, self.body_poses = None, fields.get("body_poses")
         if "obstacles" in model:
@@ -514,6 +517,7 @@ def _refuse_misfits(curves: Curves, surfaces: Surfaces | None, point_count: int)
         triangles, first = surfaces.triangles, surfaces.first
         fits = fits and 0 <= triangles.min() and triangles.max() < point_count and len(first) == len(surfaces.names)
         fits = fits and 0 == first[0] and first[-1] <= len(triangles) == len(surfaces.thickness)
+        fits = fits and (surfaces.uv is None or surfaces.uv.shape == (*triangles.shape, 2))
     if not fits:
         raise ValueError(f"rods and surfaces do not fit the {point_count} points of a frame")
 

@@ -28,7 +28,8 @@ def write_model(group: h5py.Group, model) -> None:
     for name in CURVE_FIELDS:
         overwrite(curves, name, np.asarray(getattr(model.curves, name)))
     for name in SURFACE_FIELDS if model.surfaces is not None else ():
-        overwrite(group.require_group("surfaces"), name, np.asarray(getattr(model.surfaces, name)))
+        if (values := getattr(model.surfaces, name)) is not None:
+            overwrite(group.require_group("surfaces"), name, np.asarray(values))
     for kind in ("obstacles", "rigid_bodies"):
         described = getattr(model, kind)
         for each in fields(described) if described is not None else ():

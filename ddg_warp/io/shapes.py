@@ -42,12 +42,14 @@ class Surfaces:
         first: First triangle of each surface, shape (S,), int, increasing from 0.
         names: Name of each surface, shape (S,), str.
         thickness: Thickness of each triangle [m], shape (T,), float64.
+        uv: Texture coordinates at the corners of each triangle, shape (T, 3, 2), NaN for surfaces without; None if there are none.
     """
 
     triangles: Integers
     first: Integers
     names: Names
     thickness: Floats
+    uv: Floats | None = None
 
     def parts(self) -> list[slice]:
         """Return the triangles of each surface."""
@@ -62,6 +64,7 @@ class Surfaces:
             first=(surfaces.first + len(surfaces.triangles) * world).ravel(),
             names=np.tile(surfaces.names, worlds),
             thickness=np.tile(surfaces.thickness, worlds),
+            uv=None if surfaces.uv is None else np.tile(surfaces.uv, (worlds, 1, 1)),
         )
 
 

@@ -1,10 +1,11 @@
 """Writer of recorded rods and surfaces to USD, exported together with readers, grooms and `validate`.
 
 All rods of a batch (of one name and one material) form one prim below /World, with its own preview surface. The prim is a linear
-BasisCurves, or a Mesh of tubes for programs without curves or curve materials. Every surface and every obstacle is one
-Mesh, contact is Points. A rigid body is an Xform at its centre: each frame stores its translation and orientation, while the
-spheres, capsules and meshes below it are constant. UsdPhysics gives its mass and inertia; it is kinematic, as its motion is recorded.
-z is up, lengths are in metres, times in seconds times timeCodesPerSecond.
+BasisCurves, or a Mesh of tubes for programs without curves or curve materials (Blender 5.0 drops materials of curves). Every surface
+and every obstacle is one Mesh, contact is Points. An obstacle that moves has a transform for each frame.
+A rigid body is an Xform at its centre: each frame stores its translation and orientation, while the spheres, capsules and meshes
+below it are constant. UsdPhysics gives its mass and inertia; it is kinematic, as its motion is recorded.
+The first sample of every attribute is the default, too. z is up, lengths are in metres, times in seconds times timeCodesPerSecond.
 
 USD saves a file over its old table of contents: a process killed meanwhile leaves it unreadable. The stage is therefore
 saved to `NAME.partial.usdc`, and a copy of it replaces the final file atomically after each save.

@@ -12,11 +12,9 @@ from ddg_warp.io.bodies import Bodies
 from ddg_warp.io.colors import OBSTACLE
 from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.io.usd_materials import bind_preview_surface
+from ddg_warp.io.usd_pose import DOUBLE, PoseOps, quaternion
 from ddg_warp.io.usd_prims import HEADER, Frame, define_mesh, vectors
 from ddg_warp.scene.obstacles import BALL, CAPSULE
-
-DOUBLE = UsdGeom.XformOp.PrecisionDouble  # USD takes angles from arc cosines, which lose small ones of float32
-POSE = 56  # size of a translation and a quaternion [bytes]
 
 
 class BodyPrim:
@@ -38,14 +36,13 @@ class BodyPrim:
         self.unsaved = 0
         """Upper bound of the size of unsaved values [bytes]."""
         body = UsdGeom.Xform.Define(stage, path)
-        self._translate, self._orient = body.AddTranslateOp(), body.AddOrientOp(DOUBLE)
-        self._last = Gf.Quatd(1.0)
+        self._pose = PoseOps(body)
         UsdPhysics.RigidBodyAPI.Apply(body.GetPrim()).CreateKinematicEnabledAttr(True)
         mass = UsdPhysics.MassAPI.Apply(body.GetPrim())
         mass.CreateMassAttr(float(bodies.mass[number]))
         mass.CreateCenterOfMassAttr(Gf.Vec3f(*map(float, bodies.center[number] - bodies.origin[number])))
         mass.CreateDiagonalInertiaAttr(Gf.Vec3f(*map(float, bodies.moments[number])))
-        mass.CreatePrincipalAxesAttr(Gf.Quatf(_quaternion(bodies.axes[number])))
+        mass.CreatePrincipalAxesAttr(Gf.Quatf(quaternion(bodies.axes[number])))
         bind_preview_surface(stage, body.GetPrim(), np.array(OBSTACLE))
         first = len(obstacles) - int(bodies.shapes[number:].sum()) if bodies.shapes[number] else 0
         for k in range(first, first + int(bodies.shapes[number])):
@@ -53,13 +50,9 @@ class BodyPrim:
             shape.CreateDisplayColorAttr(vectors([OBSTACLE]))
 
     def write(self, code: Usd.TimeCode, frame: Frame) -> None:
-        """Write the pose of one frame; the sign of the quaternion follows the frame before."""
+        """Write the pose of one frame."""
         pose = np.asarray(frame.body_poses[self._row], float)
-        rotation = _quaternion(pose[:, :3])
-        self._last = rotation if Gf.Dot(rotation, self._last) >= 0.0 else -rotation
-        self._translate.Set(Gf.Vec3d(*map(float, pose[:, 3])), code)
-        self._orient.Set(self._last, code)
-        self.unsaved += POSE + 2 * HEADER
+        self.unsaved += self._pose.write(code, pose[:, :3], pose[:, 3]) + 4 * HEADER
 
 
 def _define_shape(stage: Usd.Stage, path: str, obstacles: Obstacles, k: int, origin: np.ndarray) -> UsdGeom.Gprim:
@@ -86,9 +79,3 @@ def _define_shape(stage: Usd.Stage, path: str, obstacles: Obstacles, k: int, ori
         shape.AddOrientOp(DOUBLE).Set(Gf.Quatd(1.0 + z, -y, x, 0.0).GetNormalized())  # from the z axis
     shape.CreateExtentAttr(UsdGeom.Boundable.ComputeExtentFromPlugins(shape, Usd.TimeCode.Default()))
     return shape
-
-
-def _quaternion(rotation: np.ndarray) -> Gf.Quatd:
-    """Return the quaternion of a rotation matrix (3, 3)."""
-    matrix = Gf.Matrix4d(Gf.Matrix3d(*map(float, rotation.T.ravel())), Gf.Vec3d(0.0))  # of row vectors
-    return matrix.ExtractRotationQuat().GetNormalized()

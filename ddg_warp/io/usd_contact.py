@@ -9,11 +9,16 @@ from ddg_warp.geometry.operators import vertex_normals
 from ddg_warp.io.colors import CONTACT, OBSTACLE
 from ddg_warp.io.contact_records import ContactScales
 from ddg_warp.io.obstacles import Obstacles
-from ddg_warp.io.usd_prims import Frame, PointsPrim, define_mesh, floats, vectors
+from ddg_warp.io.usd_pose import PoseOps, rigid_motion
+from ddg_warp.io.usd_prims import HEADER, Frame, PointsPrim, define_mesh, floats, vectors
+
+RIGID = 1e-6  # deviation from a rigid motion, over the size of an obstacle
 
 
 class ObstaclePrim(PointsPrim):
-    """Obstacle as a Mesh, with one sample if it does not move.
+    """Obstacle as a Mesh; a moving one has constant points about their mean, and a transform for each frame.
+
+    The transform is the nearest rigid motion. An obstacle that deforms has samples of points in addition.
 
     Args:
         stage: Stage of the new prim.
@@ -31,12 +36,25 @@ class ObstaclePrim(PointsPrim):
         rows = np.arange(nodes.start, nodes.stop) + world * np.count_nonzero(obstacles.moving)
         super().__init__(mesh, rows, np.array(OBSTACLE), None)
         mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-        if not obstacles.moved[number]:
-            self._place(Usd.TimeCode.Default(), obstacles.points(number))
+        self._points, self._pose, self._rigid = obstacles.points(number), None, True
+        self._last = Usd.TimeCode.Default()
+        if obstacles.moved[number]:
+            self._points, self._pose = self._points - self._points.mean(0), PoseOps(mesh)
+        self._place(Usd.TimeCode.Default(), self._points)
 
     def write(self, code: Usd.TimeCode, frame: Frame) -> None:
-        if self._obstacles.moved[self._number]:
-            self._place(code, self._obstacles.points(self._number, frame.obstacles[self._rows]))
+        if self._pose is None:
+            return
+        points = self._obstacles.points(self._number, frame.obstacles[self._rows])
+        rotation, centre, deviation = rigid_motion(self._points, points)
+        self.unsaved += self._pose.write(code, rotation, centre) + 4 * HEADER
+        if self._rigid and deviation > RIGID * np.ptp(self._points, axis=0).max():
+            self._rigid = False
+            if not self._last.IsDefault():
+                self._place(self._last, self._points)  # the first sample holds for all times before
+        if not self._rigid:
+            self._place(code, (points - centre) @ rotation)
+        self._last = code
 
     def _place(self, code: Usd.TimeCode, points: np.ndarray) -> None:
         shown = vectors(points)

@@ -16,6 +16,7 @@ from ddg_warp.io.contact_records import Contacts
 from ddg_warp.io.rod_tubes import SIDES, tube_faces, tube_points
 from ddg_warp.io.shapes import Curves, Surfaces
 from ddg_warp.io.usd_materials import bind_preview_surface
+from ddg_warp.io.usd_texture import write_texture
 
 HEADER = 64  # largest overhead of a value in a file [bytes]
 
@@ -68,6 +69,7 @@ class PointsPrim:
         self._prim, self._rows, self._color_by = prim, rows, color_by
         self.unsaved = 0
         """Upper bound of the size of unsaved values [bytes]."""
+        self._begun: set[str] = set()
         self._primvars = UsdGeom.PrimvarsAPI(prim)
         uniform = color.ndim == 1
         kind = UsdGeom.Tokens.constant if uniform else UsdGeom.Tokens.vertex
@@ -95,15 +97,16 @@ class PointsPrim:
         primvar = self._primvars.CreatePrimvar(name, Sdf.ValueTypeNames.FloatArray, kind)
         self._sample(primvar.GetAttr(), floats(values), code)
         if self._color_by is not None and name == self._color_by.name:
-            self._color.GetAttr().ClearDefault()  # samples are at vertices or faces, the default is constant
             self._color.SetInterpolation(kind)
             colors = on_scale(values, self._color_by.low, self._color_by.high)
             self._sample(self._color.GetAttr(), vectors(colors), code)
 
     def _sample(self, attribute: Usd.Attribute, value, code: Usd.TimeCode) -> None:
-        """Set the value of an attribute at a time."""
-        attribute.Set(value, code)
-        self.unsaved += memoryview(value).nbytes + HEADER
+        """Set the value of an attribute at a time; the first is the default, too, for programs that read no samples."""
+        for time in {code, Usd.TimeCode.Default()} if attribute.GetName() not in self._begun else (code,):
+            attribute.Set(value, time)
+            self.unsaved += memoryview(value).nbytes + HEADER
+        self._begun.add(attribute.GetName())
 
     def _vertices(self, points: np.ndarray) -> np.ndarray:
         return points
@@ -204,6 +207,8 @@ class SurfacePrim(PointsPrim):
         kind = UsdGeom.Tokens.constant if uniform else UsdGeom.Tokens.uniform
         primvar = self._primvars.CreatePrimvar("thickness", Sdf.ValueTypeNames.FloatArray, kind)
         primvar.Set(floats(thickness[:1] if uniform else thickness))
+        if surfaces.uv is not None and np.isfinite(surfaces.uv[part]).all():
+            write_texture(mesh, surfaces.uv[part])
 
     def write(self, code: Usd.TimeCode, frame: Frame) -> None:
         super().write(code, frame)

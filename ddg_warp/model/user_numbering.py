@@ -57,6 +57,7 @@ class UserNumbering:
             first=triangles[:-1],
             names=np.array([shell.name for shell in self.model.scene.shells], dtype=object),
             thickness=np.concatenate([shell.plate.thickness for shell in shells]),
+            uv=_texture(self.model.scene.shells),
         )
 
     @cached_property
@@ -312,6 +313,14 @@ class UserNumbering:
             rows = self.edge_starts[rod.rod] + np.arange(len(rod.edges))
             out[:, rows] = coupled[:, rod.edges - self.model.coupled.angle_start]
         return out[0] if self.model.worlds == 1 else out
+
+
+def _texture(shells: list) -> np.ndarray | None:
+    """Return texture coordinates of all triangles (T, 3, 2), NaN for shells without; None if no shell has any."""
+    if all(shell.uv is None for shell in shells):
+        return None
+    none = [np.full((*shell.triangles.shape, 2), np.nan) for shell in shells]
+    return np.concatenate([each if shell.uv is None else shell.uv for shell, each in zip(shells, none, strict=True)])
 
 
 def _numbers(label: str, values) -> np.ndarray:

@@ -179,6 +179,7 @@ class Shell:
     rest: object
     name: str
     laws: Mapping[str, Law] = field(default_factory=dict)  # by term
+    uv: np.ndarray | None = None
 
     @property
     def points(self) -> np.ndarray:

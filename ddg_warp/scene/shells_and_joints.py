@@ -52,6 +52,7 @@ class Structures(Meridians, Magnets, Contacts):
         rest: Literal["shape", "flat"] | tuple[Numbers, Numbers] = "shape",
         name: str = "shell",
         laws: Mapping[str, Law] | None = None,
+        uv: Numbers | None = None,
     ) -> Handle:
         """Add a triangle mesh as a thin shell.
 
@@ -68,6 +69,8 @@ class Structures(Meridians, Magnets, Contacts):
                 [m^2], bbar (T, 3) [m]), first and second fundamental form in the basis of the first two edges.
             name: shown in reports and output.
             laws: a `Law` for terms by name, such as "shell_stretch" or "shell_bend_dof", instead of the material's.
+            uv: texture coordinates for recordings, at the corners of triangles (T, 3, 2), such as `read_mesh(path).uv`, or at vertices
+                (P, 2).
 
         Returns:
             Handle of the shell.
@@ -92,8 +95,9 @@ class Structures(Meridians, Magnets, Contacts):
         thickness = argument_checks.array(label, thickness, "give one number, or one a triangle [m]").copy()
         argument_checks.sized(label, thickness)
         laws = laws_of(f"shell '{name}'", laws)
+        uv = None if uv is None else _texture(f"shell '{name}': uv", uv, surface)
         _warn_of_pieces(surface)
-        self.shells.append(Shell(surface, thickness, deepcopy(material), bending, membrane, rest, name, laws))
+        self.shells.append(Shell(surface, thickness, deepcopy(material), bending, membrane, rest, name, laws, uv))
         return Handle(len(self.shells) - 1, SHELL, name)
 
     def hold(
@@ -442,6 +446,19 @@ def _forms(label: str, rest, triangles: int) -> tuple[np.ndarray, np.ndarray]:
             raise SceneError(f"{label} has shape {values.shape}; both arrays are finite and of shape {(triangles, 3)}")
         argument_checks.sized(label, values)
     return forms
+
+
+def _texture(label: str, uv, surface: Surface) -> np.ndarray:
+    """Return texture coordinates at the corners of triangles (T, 3, 2)."""
+    values = argument_checks.array(label, uv, "give (T, 3, 2) at corners of triangles, or (P, 2) at vertices")
+    if values.shape == (len(surface.points), 2):
+        values = values[surface.triangles]
+    if values.shape != (*surface.triangles.shape, 2) or not np.isfinite(values).all():
+        raise SceneError(
+            f"{label} has shape {values.shape}; give finite numbers, {(*surface.triangles.shape, 2)} at corners of triangles or "
+            f"{(len(surface.points), 2)} at vertices"
+        )
+    return values.copy()
 
 
 def _warn_of_pieces(surface: Surface) -> None:

@@ -109,6 +109,7 @@ def observe_state(state) -> list:
         reactions,
         names,
         model.curves.names.tolist(),
+        [] if model.surfaces is None or model.surfaces.uv is None else model.surfaces.uv,
     ]
 
 
@@ -407,7 +408,7 @@ def two_sheets(scene: ddg.Scene) -> None:
 
 scene_call("add_shell", SHEET | {"thickness": 0.05, "material": RUBBER}, {
     "points": SHEET["points"] * 1.1, "triangles": SHEET["triangles"][::-1], "thickness": 0.06, "material": ddg.Material(2e6, 0.3),
-    "bending": "hinge", "membrane": Change("curved", refused=True), "name": "odd",
+    "bending": "hinge", "membrane": Change("curved", refused=True), "name": "odd", "uv": SHEET["points"][:, :2],
     "laws": Change({"shell_hinge": ddg.Law(quadratic, stiffness=1e-3)}, {"bending": "hinge"}),
     "rest": Change("flat", {"points": SHEET["points"] + [0, 0, 1] * (SHEET["points"][:, :1] - 0.3) ** 2}, "shape")},
     lambda s: None, lambda s: s.clamp_boundary(0, [0, 1, 2]))  # fmt: skip

@@ -12,6 +12,8 @@ from ddg_warp.geometry import meshes
 from ddg_warp.geometry.surface import Surface
 from ddg_warp.io import CurveError, MeshError, read
 from ddg_warp.io.mesh_read import read_mesh
+from ddg_warp.io.usd import validate
+from ddg_warp.run.recorder import export_usd
 
 # A square under a pyramid, and a pentagon aside that is not convex. Vertex 10 belongs to a tetrahedron alone.
 POINTS = np.array(
@@ -172,6 +174,30 @@ def test_obj_texture_and_unread_contents(tmp_path):
     with pytest.warns(SceneWarning):
         mesh = read_mesh(tmp_path / "b.obj")
     assert mesh.uv is None and "4 texture coordinates (vt), as 3 corners have none" in mesh.unread
+
+
+def test_texture_of_a_shell_is_recorded(tmp_path):
+    """Texture coordinates go from a file through the scene to the recording, its export and a resumed run."""
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0.25 1\nf 1/3 2/1 3/2\n")
+    mesh = read_mesh(tmp_path / "a.obj")
+    scene, material = ddg.Scene(), ddg.Material(young=1e6, poisson=0.3, density=1000.0)
+    scene.add_shell(*mesh[:2], thickness=1e-3, material=material, name="flag", uv=mesh.uv)
+    scene.add_shell(mesh.points + 1.0, mesh.triangles, thickness=1e-3, material=material, name="plain")
+    model = scene.build(device="cpu", worlds=2)
+    with ddg.Recorder(model, tmp_path / "run") as recorder:
+        recorder.record(model.state())
+    with ddg.Recorder(model, tmp_path / "run", resume=True):
+        pass
+    export_usd(tmp_path / "run" / "trajectory.h5", tmp_path / "run" / "export.usda")
+    for name in ("scene.usdc", "export.usda"):
+        assert validate(tmp_path / "run" / name) == []
+        for prim in ("flag", "flag_2"):
+            np.testing.assert_array_equal(read_mesh(tmp_path / "run" / name, f"/World/{prim}").uv, mesh.uv)
+        assert read_mesh(tmp_path / "run" / name, "/World/plain").uv is None
+    with pytest.raises(
+        ddg.SceneError, match=r"shell 'sheet': uv has shape \(1, 2\); give finite .*\(1, 3, 2\) at corners"
+    ):
+        scene.add_shell(*mesh[:2], thickness=1e-3, material=material, name="sheet", uv=[[0.0, 1.0]])
 
 
 @pytest.mark.parametrize("kind", ["vertex", "faceVarying"])

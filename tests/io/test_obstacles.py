@@ -7,7 +7,10 @@ from recorded_run import record
 
 import ddg_warp as ddg
 from ddg_warp.geometry import meshes
+from ddg_warp.io import Curves
 from ddg_warp.io.hdf5 import TrajectoryError, TrajectoryReader
+from ddg_warp.io.obstacles import Obstacles
+from ddg_warp.io.usd import CurvesWriter
 from ddg_warp.io.usd_check import validate
 from ddg_warp.run.cli import main
 from ddg_warp.run.outputs import standing
@@ -103,11 +106,16 @@ def test_recorded_obstacles_and_contacts_read_back(device, tmp_path, worlds):
         assert len(shown[0.0][1]) > len(shown[0.06][1])  # static obstacles are stored once
     assert validate(tmp_path / "scene.usdc") == []
     stage = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
-    still, moved = (UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/{name}")).GetPointsAttr() for name in ("head", "box"))
-    assert still.GetNumTimeSamples() == 0
-    assert moved.GetNumTimeSamples() == 7
-    last = model.obstacles.points(3, np.reshape(states[-1].obstacle_points(), (-1, 11, 3))[0, model.obstacles.rows(3)])
-    np.testing.assert_allclose(moved.Get(moved.GetTimeSamples()[-1]), last, atol=1e-7)
+    still, moved = (UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/{name}")) for name in ("head", "box"))
+    assert still.GetPointsAttr().GetNumTimeSamples() == moved.GetPointsAttr().GetNumTimeSamples() == 0
+    assert len(moved.GetTimeSamples()) == 7 and not still.GetOrderedXformOps()
+    for number, name in ((1, "ball"), (2, "capsule"), (3, "box")):
+        nodes = np.reshape(states[-1].obstacle_points(), (-1, 11, 3))[0, model.obstacles.rows(number)]
+        shown = shown_points(stage, f"/World/{name}", moved.GetTimeSamples()[-1])
+        np.testing.assert_allclose(shown, model.obstacles.points(number, nodes), atol=1e-7)
+    np.testing.assert_allclose(shown_points(stage, "/World/box"), model.obstacles.points(3), atol=1e-7)  # the default
+    sampled = [each for prim in stage.Traverse() for each in prim.GetAttributes() if each.GetNumTimeSamples()]
+    assert sampled and all(each.Get() is not None for each in sampled)  # Newton refuses meshes without defaults
     assert bool(stage.GetPrimAtPath("/World/box_2")) == (worlds == 2)
     points = UsdGeom.Points(stage.GetPrimAtPath("/World/contacts"))
     time = points.GetPointsAttr().GetTimeSamples()[-1]
@@ -116,6 +124,29 @@ def test_recorded_obstacles_and_contacts_read_back(device, tmp_path, worlds):
     widths = np.array(points.GetWidthsAttr().Get(time))
     forces = np.linalg.norm(expected.force, axis=1)
     assert widths[forces.argmax()] == widths.max() > 0.0
+
+
+def shown_points(stage, path: str, code=Usd.TimeCode.Default()) -> np.ndarray:  # noqa: B008
+    """Return the points of a mesh in the world at a time code."""
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(path))
+    matrix = np.array(mesh.ComputeLocalToWorldTransform(code))
+    return np.array(mesh.GetPointsAttr().Get(code), float) @ matrix[:3, :3] + matrix[3, :3]
+
+
+def test_obstacles_that_deform_have_samples_of_points(tmp_path):
+    """Transforms are written while the motion is rigid; from the first frame that is not, points are sampled."""
+    surface = ddg.Mesh(*HEAD)
+    obstacles = Obstacles.of([(surface, "head", True)], HEAD[0])
+    no_rods = Curves(np.zeros(0, int), np.zeros(0, bool), np.zeros(0), np.zeros(0, object), np.zeros(0, int))
+    frames = [MOTION.place(k, surface.points) * (1.0 if k < 2 else [1.0, 1.0 + 0.1 * k, 1.0]) for k in range(4)]
+    with CurvesWriter(tmp_path / "a.usda", no_rods, fps=1.0, obstacles=obstacles) as writer:
+        for k, nodes in enumerate(frames):
+            writer.write(float(k), np.zeros((0, 3)), obstacles=nodes)
+    assert validate(tmp_path / "a.usda") == []
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    assert UsdGeom.Mesh(stage.GetPrimAtPath("/World/head")).GetPointsAttr().GetTimeSamples() == [1.0, 2.0, 3.0]
+    for k, nodes in enumerate(frames):
+        np.testing.assert_allclose(shown_points(stage, "/World/head", k), obstacles.points(0, nodes), atol=1e-6)
 
 
 def test_resumed_run_equals_uninterrupted_run(device, tmp_path):
