@@ -539,6 +539,33 @@ def test_export(fall, tmp_path, flags):
     assert kind(shapes[0]).GetPointsAttr().GetNumTimeSamples() == 6
 
 
+def test_every_and_fps_of_runs_and_exports(fall, capsys):
+    """Every second of 10 steps is recorded, also after a resume; time codes are seconds times frames per second."""
+    from pxr import Usd, UsdGeom
+
+    def times(path):
+        stage = Usd.Stage.Open(path)
+        (rods,) = (UsdGeom.BasisCurves(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.BasisCurves))
+        return [round(code / stage.GetTimeCodesPerSecond(), 9) for code in rods.GetPointsAttr().GetTimeSamples()]
+
+    settings = ("--dt", "0.005", "--every", "2", "--fps", "24")
+    assert fall("run", "--dt", "0.005", "--out", "all") == 0
+    assert fall("run", *settings, "--out", "straight") == 0
+    assert fall("run", *settings, "--out", "parts", "--duration", "0.02") == 0
+    fall("run", "--resume", "parts", "--duration", "0.05")  # the check of the scene counts recorded states
+    for directory in ("straight", "parts"):
+        np.testing.assert_array_equal(points(directory), points("all")[::2])
+        assert summary(directory)["steps"] == 10
+    assert times("straight/scene.usdc") == [0.0, 0.01, 0.02, 0.03, 0.04, 0.05]
+    assert Usd.Stage.Open("straight/scene.usdc").GetTimeCodesPerSecond() == 24.0
+    assert main(["export", "all", "--to", "some.usda", "--every", "5", "--fps", "60"]) == 0
+    assert times("some.usda") == [0.0, 0.025, 0.05] and Usd.Stage.Open("some.usda").GetTimeCodesPerSecond() == 60.0
+    assert fall("run", "--every", "3", "--out", "odd") == 2
+    assert "the run has 5 steps; give a divisor" in capsys.readouterr().err
+    assert main(["export", "all", "--to", "some.mp4", "--fps", "60"]) == 2
+    assert "--every and --fps are for USD" in capsys.readouterr().err
+
+
 def test_bench_gives_error_and_time_together(fall, tmp_path):
     assert fall("bench") == 0
     with open("out/bench/fall.json") as file:

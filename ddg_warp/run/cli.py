@@ -98,6 +98,10 @@ def parser(arguments: list[str]) -> Parser:
         metavar="NAME,...",
         help="record these too, such as velocities,directors,contacts,axial_force,shell_energy",
     )
+    run.add_argument("--every", type=int, metavar="N", help="record every N-th step (default: 1)")
+    run.add_argument(
+        "--fps", type=float, metavar="F", help="frames per second of scene.usdc (default: of recorded steps)"
+    )
     run.add_argument("--json", type=Path, metavar="FILE", help="write the summary to FILE too")
     run.add_argument("--movie", type=Path, metavar="FILE", help="write a movie of the run to FILE.mp4 (extra `render`)")
     if arguments[:1] == ["run"] and len(arguments) > 1 and not arguments[1].startswith("-"):
@@ -156,6 +160,8 @@ def parser(arguments: list[str]) -> Parser:
     export.add_argument(
         "--to", type=Path, metavar="FILE", help="a .usdc, .usda, .mp4 or .rrd file (default: DIR/export.usdc)"
     )
+    export.add_argument("--every", type=int, default=1, metavar="N", help="write every N-th frame to USD (default: 1)")
+    export.add_argument("--fps", type=float, metavar="F", help="frames per second in USD (default: of the frames)")
     export.add_argument("--tube", action="store_true", help="write tube meshes, not curves")
     export.add_argument(
         "--revolve", type=int, default=0, metavar="N", help="convert meridians to surfaces of revolution of N sides"
@@ -229,6 +235,8 @@ def run_scene(chosen: argparse.Namespace) -> int:
                 resume=run_directory if chosen.resume is not None else None,
                 force=chosen.force,
                 fields=[name for name in (chosen.fields or "").split(",") if name],
+                every=chosen.every,
+                fps=chosen.fps,
                 module=module,
                 provenance={"scene": name, "parameters": settings, "command": shlex.join(["ddg-warp", *sys.argv[1:]])},
                 **run_settings,
@@ -396,6 +404,8 @@ def export_run(chosen: argparse.Namespace) -> int:
     target = chosen.to or chosen.directory / "export.usdc"
     if target.suffix not in (".usda", ".usdc", ".mp4", ".rrd"):
         raise InputError(f"--to {target}: the file must end in .usdc, .usda, .mp4 or .rrd")
+    if target.suffix in (".mp4", ".rrd") and (chosen.every != 1 or chosen.fps is not None):
+        raise InputError(f"--to {target}: --every and --fps are for USD; leave them out")
     if chosen.revolve and chosen.revolve < 3:
         raise InputError(f"--revolve {chosen.revolve}: a surface of revolution has 3 sides at least")
     try:
@@ -412,7 +422,7 @@ def export_run(chosen: argparse.Namespace) -> int:
 
             export_rerun(source, target)
         else:
-            export_usd(source, target, tube=chosen.tube, revolve=chosen.revolve)
+            export_usd(source, target, tube=chosen.tube, revolve=chosen.revolve, every=chosen.every, fps=chosen.fps)
     print(f"wrote {target}")
     return DONE
 

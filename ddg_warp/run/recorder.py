@@ -406,7 +406,9 @@ def _others(reader, frame: int) -> dict[str, np.ndarray | Contacts]:
     return {name: frames[frame] for name, frames in fields.items() if frames is not None}
 
 
-def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False, revolve: int = 0) -> None:
+def export_usd(
+    trajectory, path, *, fps: float | None = None, tube: bool = False, revolve: int = 0, every: int = 1
+) -> None:
     """Write the frames of a trajectory.h5 as USD.
 
     Args:
@@ -415,6 +417,7 @@ def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False
         fps: Time codes per second; by default one time code a frame.
         tube: Whether to write tubes instead of curves.
         revolve: Sides of the surfaces of revolution around z of the curves (meridians) of the first world; 0 for none.
+        every: Frames of the trajectory from one written frame to the next; the first is written.
 
     Raises:
         ValueError: The trajectory cannot be read or has no frames, or an option is invalid.
@@ -427,15 +430,16 @@ def export_usd(trajectory, path, *, fps: float | None = None, tube: bool = False
             f"export_usd: revolve = {revolve}; a surface of revolution has 3 sides at least, or 0 for none"
         )
     argument_checks.flag("export_usd: tube", tube)
+    every = argument_checks.count("export_usd: every", every)
     try:
-        _export(trajectory, path, fps, tube, revolve)
+        _export(trajectory, path, fps, tube, revolve, every)
     except OSError as error:
         if isinstance(error, ValueError) or error.errno is None:
             raise
         raise system_error(path, error) from error
 
 
-def _export(trajectory, path, fps: float | None, tube: bool, revolve: int) -> None:
+def _export(trajectory, path, fps: float | None, tube: bool, revolve: int, every: int) -> None:
     from ddg_warp.io.hdf5 import TrajectoryReader
     from ddg_warp.io.surface_of_revolution import Revolution
     from ddg_warp.io.usd import CurvesWriter
@@ -444,7 +448,8 @@ def _export(trajectory, path, fps: float | None, tube: bool, revolve: int) -> No
         worlds = int(np.prod(reader.points.shape[1:-2]))
         if not len(reader):
             raise SceneError(f"{trajectory} has no frames; export a run that wrote a block")
-        spacing = np.median(np.diff(reader.time)) if len(reader) > 1 else 1.0 / DEFAULT_FPS
+        times = reader.time[::every]
+        spacing = np.median(np.diff(times)) if len(times) > 1 else 1.0 / DEFAULT_FPS
         shapes = Shapes.of(reader.curves, reader.surfaces, worlds)
         count = int(np.sum(reader.curves.counts))
         first = reader.points[0].reshape(-1, 3)[:count]
@@ -458,7 +463,7 @@ def _export(trajectory, path, fps: float | None, tube: bool, revolve: int) -> No
         options = {} if revolved else options | {"attributes": reader.attributes}
         with CurvesWriter(path, shapes, fps=fps or frame_rate(spacing), tube=tube, **options) as writer:
             shape = (worlds, reader.points.shape[-2])
-            for frame, time in enumerate(reader.time):
+            for frame, time in zip(range(0, len(reader), every), times, strict=True):
                 points = reader.points[frame].reshape(-1, 3)
                 if revolved:
                     writer.write(time, revolved.points(points[:count]))

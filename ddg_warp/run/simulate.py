@@ -197,6 +197,8 @@ def simulate(
     wrenches: bool = False,
     clock: Callable[[], float] | None = None,
     progress: bool = True,
+    every: int | None = None,
+    fps: float | None = None,
 ) -> Result:
     """Run the analysis of a scene, as `ddg-warp run` does: record, check, and draw.
 
@@ -224,6 +226,9 @@ def simulate(
         wrenches: Whether to keep forces and moments of supports, see `Result.wrenches`.
         clock: Clock of `step_times` [s]; by default wall time, synchronised on CUDA.
         progress: Whether to show progress: a bar on a terminal, a line every ten seconds elsewhere.
+        every: Steps from one recorded state to the next, by default 1, or as in the resumed run; the number of steps is a multiple.
+            `Result.times` has all steps, but of a resumed run the recorded ones.
+        fps: Time codes per second of scene.usdc; by default one time code a recorded state.
 
     Returns:
         The result, with `failure` if the run ended early.
@@ -240,6 +245,8 @@ def simulate(
     _check(
         worlds,
         fields,
+        every,
+        fps,
         flags={"force": force, "usd": usd, "progress": progress, "picture": picture, "wrenches": wrenches},
         functions={"observe": observe, "check": check, "clock": clock},
         mappings={"provenance": provenance, "options": options},
@@ -247,8 +254,8 @@ def simulate(
     )
     analysis = scene.analysis
     dynamic = isinstance(analysis, Dynamics)
-    if not dynamic and (dt, duration, resume) != (None, None, None):
-        raise InputError("this scene is static: it takes no dt, no duration and nothing to resume")
+    if not dynamic and any(each is not None for each in (dt, duration, resume, every)):
+        raise InputError("this scene is static: it takes no dt, no duration, no every and nothing to resume")
     if isinstance(analysis, PathAnalysis) and (controls is not None or wrenches):
         raise InputError(
             "a path takes no controls and no wrenches; leave them out, and call model.reactions(point.state, factor=point.load) for "
@@ -265,8 +272,9 @@ def simulate(
                 raise InputError(
                     "a resumed run goes on in its directory, and replaces nothing: leave out `force` and `out`"
                 )
-            asked = {"dt": dt, "precision": precision, "worlds": worlds, "fields": set(fields) or None}
+            asked = {"dt": dt, "precision": precision, "worlds": worlds, "fields": set(fields) or None, "every": every}
             stored |= settings_to_resume(Path(resume), asked)
+            every = stored["every"]
             precision, fields = stored["precision"], ()
         dt = stored["dt"] if dt is None else dt
         duration = stored["duration"] if duration is None else duration
@@ -276,6 +284,11 @@ def simulate(
     else:
         run, steps = follow, analysis.stop.steps
 
+    every = 1 if every is None else every
+    if steps % every:
+        raise InputError(
+            f"every = {every}: the run has {steps} steps; give a divisor, so that the last state is recorded"
+        )
     model = scene.build(device=device, precision=precision, worlds=worlds)
     about = provenance or {}
     result = Result(scene, model, model.state(), dt=dt, name=about.get("scene", "scene"), times=[])
@@ -289,7 +302,7 @@ def simulate(
             _finish(result, None, out, module, False)
             return result
     counts = continue_from(result, Path(resume), duration) if resume is not None else {}
-    done = max(0, len(result.times) - 1)
+    done = every * max(0, len(result.times) - 1)
     earlier = {name: float(counts.get(f"clock/{name}", 0.0)) for name in ("wall", "compile")}
     counted: Callable[[], dict[str, np.ndarray]] | None = None
 
@@ -313,7 +326,9 @@ def simulate(
         elif out is not None or resume is not None:
             attributes = {**(provenance or {}), "dt": dt or 0.0, "precision": model.precision, "worlds": worlds}
             attributes |= {"duration": duration} if dynamic else {}
+            attributes |= {"every": every} if every > 1 else {}
             keywords = {"provenance": attributes, "force": force, "fields": fields, "usd": usd, "counts": tallied}
+            keywords |= {"every": every, "fps": fps}
             recorder = stack.enter_context(open_recorder(model, out, resume, dt, **keywords))
         if resume is not None:
             for callback in scene.callbacks:  # restore parameters that depend on time
@@ -376,9 +391,15 @@ def _finish(result: Result, check: Callable | None, directory, module, picture: 
             draw(Path(directory), module, result)
 
 
-def _check(worlds, fields, *, flags: Mapping, functions: Mapping, mappings: Mapping, paths: Mapping) -> None:
+def _check(
+    worlds, fields, every, fps, *, flags: Mapping, functions: Mapping, mappings: Mapping, paths: Mapping
+) -> None:
     """Raise an error that names the first invalid argument of `simulate`."""
     argument_checks.count("worlds", worlds)
+    if every is not None:
+        argument_checks.count("every", every)
+    if fps is not None:
+        argument_checks.positive("fps", fps, "1/s")
     for name, value in flags.items():
         argument_checks.flag(name, value)
     for name, value in functions.items():
@@ -561,6 +582,7 @@ def settings_to_resume(directory: Path, asked: Mapping[str, object] | None = Non
     if not {*RUN_SETTINGS} <= stored.keys():
         raise InputError(f"{path} is not of `simulate`: resume it where it was made, with Recorder(resume=True)")
     settings = {name: stored[name] for name in (*RUN_SETTINGS, "duration") if name in stored}
+    settings["every"] = int(stored.get("every", 1))
     always = ("points", "obstacle_points", "body_poses")
     recorded = {name for name in fields if name not in always and "/" not in name}
     for name, value in (asked or {}).items():
@@ -603,7 +625,7 @@ def continue_from(result: Result, directory: Path, duration: float) -> dict[str,
     return counts
 
 
-def open_recorder(model, out, resume, dt, *, provenance, fields, **options):
+def open_recorder(model, out, resume, dt, *, provenance, fields, every=1, fps=None, **options):
     """Return the recorder of a run in `out`, or of the run to resume."""
     from ddg_warp.run.recorder import Recorder, frame_rate
 
@@ -612,7 +634,8 @@ def open_recorder(model, out, resume, dt, *, provenance, fields, **options):
         provenance = {name: provenance[name] for name in provenance.keys() & {"duration"}}
     asked = {name: name in fields for name in ("velocities", "directors", "contacts")}
     fields = [name for name in fields if name not in asked]
-    options |= {"fps": frame_rate(dt) if dt else None, "resume": again, "fields": fields, "provenance": provenance}
+    options |= {"fps": fps or (frame_rate(every * dt) if dt else None), "every": every}
+    options |= {"resume": again, "fields": fields, "provenance": provenance}
     return Recorder(model, out if out is not None else resume, **options, **asked)
 
 

@@ -33,7 +33,7 @@ def summary(scene: str, parameters: Mapping, result, checks: Iterable) -> dict:
         "device": str(result.model.device),
         "precision": result.model.precision,
         "dt": result.dt,
-        "steps": max(0, len(result.times) - 1),
+        "steps": _steps(result),
         "sim_time": float(result.state.time),
         "wall_time": result.wall_time,
         "compile_time": result.compile_time,
@@ -53,6 +53,12 @@ def summary(scene: str, parameters: Mapping, result, checks: Iterable) -> dict:
     if result.dt is None:
         content["stable"] = result.state.stable
     return content | ({"failure": result.failure} if result.failure else {})
+
+
+def _steps(result) -> int:
+    """Return the number of steps; a resumed run may have recorded some of them only."""
+    times = result.times
+    return round((times[-1] - times[0]) / result.dt) if result.dt and len(times) else max(0, len(times) - 1)
 
 
 def contact_line(contact: Mapping) -> str:

@@ -139,6 +139,8 @@ def run(**options):
     return simulate(scene, device=DEVICE, **({"progress": False} | options))
 
 
+each("simulate", "every", [0, -1, 1.5, "second", True], lambda v: run(every=v), "every", "whole number")
+each("simulate", "fps", [0.0, -24.0, NAN, "film"], lambda v: run(fps=v), "fps", "positive")
 each("simulate", "dt", [0.0, -1.0, NAN], lambda v: run(dt=v), "dt =", "positive")
 each("simulate", "duration", [0.0, -1.0], lambda v: run(duration=v), "duration =", "positive")
 each("simulate", "text", ["0.01", None], lambda v: run(dt="0.01", duration=v), "dt")
