@@ -49,6 +49,7 @@ class ContactParameters:
             ended at the minimum gap from below; zero for a given stiffness.
         ways: anisotropic friction multipliers for sliding forwards, backwards and across a rod (groups, groups, 3).
         ignored: pairs of groups without contact.
+        roots: arc length from the first node of rods [m] that has no contact with other groups, by group of the rods.
     """
 
     law: Contact
@@ -63,6 +64,7 @@ class ContactParameters:
     range: np.ndarray
     inertia: np.ndarray
     ignored: list[tuple[int, int]] = field(default_factory=list)
+    roots: dict[int, tuple[float, list[int]]] = field(default_factory=dict)
 
     @property
     def numbers(self) -> dict[str, np.ndarray]:

@@ -47,7 +47,7 @@ class Contact:
 class Between:
     """Contact settings between objects of two names; None means as in `Contact`.
 
-    Friction is one coefficient, or three: forwards, backwards and across.
+    Friction is one coefficient, or three: forwards, backwards and across. The root length is of rods of the first name.
     """
 
     names: tuple[str, str]
@@ -55,6 +55,7 @@ class Between:
     friction: float | tuple[float, float, float] | None
     stiffness: float | None
     range: float | None
+    root_length: float | None = None
 
 
 @argument_checks.called
@@ -156,6 +157,7 @@ class Contacts:
         friction: float | tuple[float, float, float] | None = None,
         stiffness: float | None = None,
         range: float | None = None,
+        root_length: float | None = None,
     ) -> None:
         """Override contact settings between objects of two names, or among objects of one; the last call counts.
 
@@ -166,15 +168,20 @@ class Contacts:
                 (towards the last node), backwards, and across (snakes, worms, bristles). `kernels.collision.friction.potential`
                 interpolates between these directions.
             stiffness, range: as of `contact`.
+            root_length: arc length [m] from the first node of rods named `one`, within which they have no contact with `other`, the
+                surface that they grow from. Edges that start and nodes that lie within are left out, and have contact with all else.
 
         Raises:
-            SceneError: an invalid argument; at `build`, three coefficients between other objects than rods and an obstacle.
+            SceneError: an invalid argument. At `build`, three coefficients between other objects than rods and an obstacle, or a root
+                length of other objects than rods, or two of the same rods.
         """
         for argument, name in (("one", one), ("other", other)):
             argument_checks.text(f"contact_between: {argument}", name)
         call = f"contact_between {one!r} and {other!r}: "
         stiffness = None if stiffness is None else argument_checks.positive(f"{call}stiffness", stiffness, "N/m")
         range = None if range is None else argument_checks.positive(f"{call}range", range, "m")
+        if root_length is not None:
+            root_length = argument_checks.positive(f"{call}root_length", root_length, "m")
         if np.iterable(friction) and not isinstance(friction, str):
             friction = argument_checks.vector(f"{call}friction forwards, backwards and across", friction)
             for direction, value in zip(DIRECTIONS, friction, strict=True):
@@ -184,14 +191,19 @@ class Contacts:
         ignore = argument_checks.flag(f"{call}ignore", ignore)
         overrides = [
             name
-            for name, value in (("friction", friction), ("stiffness", stiffness), ("range", range))
+            for name, value in (
+                ("friction", friction),
+                ("stiffness", stiffness),
+                ("range", range),
+                ("root_length", root_length),
+            )
             if value is not None
         ]
         if ignore and overrides:
             raise SceneError(f"{call}ignored pairs have no {overrides[0]}; give ignore or {overrides[0]}")
         if not (ignore or overrides):
-            raise SceneError(f"{call}no exception; give ignore=True, friction, stiffness or range")
-        self.betweens.append(Between((one, other), ignore, friction, stiffness, range))
+            raise SceneError(f"{call}no exception; give ignore=True, friction, stiffness, range or root_length")
+        self.betweens.append(Between((one, other), ignore, friction, stiffness, range, root_length))
 
     def add_obstacle(
         self, shape: Plane | Sphere | Capsule | Mesh, *, motion: Motion | Grip | None = None, name: str = "obstacle"
@@ -271,6 +283,7 @@ def check_contact(scene) -> None:
             )
         if isinstance(between.friction, tuple):
             _check_directed(scene, between, obstacles)
+    _check_roots(scene)
 
 
 def _check_directed(scene, between: Between, obstacles: set[str]) -> None:
@@ -283,6 +296,20 @@ def _check_directed(scene, between: Between, obstacles: set[str]) -> None:
             f"contact_between {a!r} and {b!r}: friction forwards, backwards and across is of rods on an obstacle, and names of "
             "their own; give one coefficient"
         )
+
+
+def _check_roots(scene) -> None:
+    """Refuse roots of other objects than rods, and two root lengths of the same rods."""
+    rods, lengths = {batch.name for batch in scene.batches}, {}
+    for between in scene.betweens:
+        if between.root_length is None:
+            continue
+        one, partner = between.names
+        call = f"contact_between {one!r} and {partner!r}: root_length"
+        if one not in rods:
+            raise SceneError(f"{call} is of rods, and {one!r} are none; name rods first")
+        if lengths.setdefault(one, between.root_length) != between.root_length:
+            raise SceneError(f"{call} is {between.root_length}, and {lengths[one]} for another object; give one length")
 
 
 def contact_names(scene) -> set[str]:

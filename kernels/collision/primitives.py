@@ -48,6 +48,7 @@ def surface_struct(real):
     `nodes` (count, 1 to 3); `object` (count,): index of the object of a primitive. `radius` (worlds, objects) [m].
     `span` (count,): (start, end, loop, apart) of edges of rods [m]. These are arc lengths of the ends, of the whole rod if it is closed
     (else 0), and the collision exclusion distance (-1 for edges of no rod).
+    `root` (count,): class of the root of a rod that an edge or a node belongs to, -1 for none; empty if there are no classes.
     """
     span_type = wp.types.vector(4, real)
 
@@ -57,6 +58,7 @@ def surface_struct(real):
         radius: wp.array2d(dtype=real)
         object: wp.array(dtype=int)
         span: wp.array(dtype=span_type)
+        root: wp.array(dtype=int)
         nodes_a_world: int
 
     return Surface
@@ -67,7 +69,8 @@ def sides_struct(real):
     """Two surfaces that form pairs.
 
     `first`, `second`: see `surface_struct`; `counts`: their primitives in one world.
-    `ignored`: sorted keys of pairs of objects without contact, smaller index times `objects` + larger one.
+    `ignored`: sorted keys of pairs of objects without contact, smaller index times `objects` + larger one; and of roots and objects,
+    (`objects` + class) times `objects` + object.
     `obstacle` (objects,): not zero for obstacles, of which no two form a pair.
     """
     surface = surface_struct(real)
@@ -133,6 +136,22 @@ def pair_functions(kind: Kind, real):
         return gap < a[3]
 
     @wp.func
+    def ignores(sides: Sides, key: wp.int64):
+        index = wp.lower_bound(sides.ignored, key)
+        if index < sides.ignored.shape[0]:
+            return sides.ignored[index] == key
+        return False
+
+    @wp.func
+    def grows_from(sides: Sides, root: wp.array(dtype=int), i: int, partner: int):
+        """Return True if primitive i is at the root of a rod, and its class has no contact with an object."""
+        if root.shape[0] == 0:
+            return False
+        if root[i] < 0:
+            return False
+        return ignores(sides, wp.int64(sides.objects + root[i]) * wp.int64(sides.objects) + wp.int64(partner))
+
+    @wp.func
     def may_touch(sides: Sides, i: int, j: int):
         if wp.static(kind.alike):
             if j <= i:
@@ -151,9 +170,9 @@ def pair_functions(kind: Kind, real):
             if a == b and within(sides.first.span[i], sides.second.span[j]):
                 return False
         if sides.ignored.shape[0] > 0:
-            key = wp.int64(wp.min(a, b)) * wp.int64(sides.objects) + wp.int64(wp.max(a, b))
-            index = wp.lower_bound(sides.ignored, key)
-            if index < sides.ignored.shape[0] and sides.ignored[index] == key:
+            if ignores(sides, wp.int64(wp.min(a, b)) * wp.int64(sides.objects) + wp.int64(wp.max(a, b))):
+                return False
+            if grows_from(sides, sides.first.root, i, b) or grows_from(sides, sides.second.root, j, a):
                 return False
         return True
 

@@ -124,7 +124,7 @@ def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: n
     rough = np.full((count, count, 3), law.friction)
     force, inertia = (_of_both(values, group, moving) for values in (scale, INERTIA * mass))
     stiffness = np.full((count, count), np.nan if law.stiffness is None else law.stiffness)
-    ignored, index = [], {name: i for i, name in enumerate(names.tolist())}
+    ignored, roots, index = [], {}, {name: i for i, name in enumerate(names.tolist())}
     for between in scene.betweens:
         g, h = (index[name] for name in between.names)
         for table, value in ((rough, between.friction), (stiffness, between.stiffness), (within, between.range)):
@@ -132,6 +132,8 @@ def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: n
                 table[g, h] = table[h, g] = value
         if between.ignore:
             ignored.append((g, h))
+        if between.root_length is not None:
+            roots.setdefault(g, (between.root_length, []))[1].append(h)
     _refuse_ranges(scene, within, names)
     explicit = bool(np.isfinite(stiffness).any())
     inertia = np.where(np.isnan(stiffness), inertia, 0.0)
@@ -150,6 +152,7 @@ def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: n
         within,
         inertia,
         ignored,
+        roots,
     )
 
 

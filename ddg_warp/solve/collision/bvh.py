@@ -105,6 +105,7 @@ class Primitives:
         self.surface.radius = radius
         self.surface.object = wp.array(owner, dtype=int, device=device)
         self.surface.span = wp.array(np.ascontiguousarray(span), dtype=wp.types.vector(4, real), device=device)
+        self.surface.root = wp.array(shapes.roots(size), dtype=int, device=device)
         self.surface.nodes_a_world = len(shapes.points)
         starts = bundle_starts(owner, span if size == 2 else None, BUNDLE[device.is_cpu])
         self.bvh_leaves = wp.array(starts, dtype=int, device=device)

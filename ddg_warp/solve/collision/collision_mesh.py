@@ -21,6 +21,7 @@ class CollisionMesh:
         names, radii: of all objects [m]; obstacle: numbers of the obstacles.
         ignored_pairs: pairs of objects without contact, the smaller number first.
         spinning: first node and markers of objects with rotating surfaces, by number.
+        roots_ignored: pairs of classes of roots and objects without contact.
     """
 
     def __init__(self, points: np.ndarray):
@@ -35,6 +36,8 @@ class CollisionMesh:
         self.ignored_pairs: set[tuple[int, int]] = set()
         self.spinning: dict[int, np.ndarray] = {}
         self._rotations: dict[int, int] = {}
+        self.roots_ignored: set[tuple[int, int]] = set()
+        self._roots: dict[int, tuple[int, float]] = {}
 
     def rod(
         self,
@@ -167,6 +170,41 @@ class CollisionMesh:
                 )
         self.ignored_pairs.add((min(first, second), max(first, second)))
 
+    def root(self, number: int, kind: int, length: float) -> None:
+        """Give edges and nodes of a rod within an arc length [m] from the first node a class of roots; see `ignore_root`."""
+        self._roots[number] = kind, length
+
+    def ignore_root(self, kind: int, number: int) -> None:
+        """Exclude contact between the roots of a class and an object."""
+        self.roots_ignored.add((kind, number))
+
+    def roots(self, size: int) -> np.ndarray:
+        """Return the class of the root that each primitive of a size belongs to (n,), -1 for none; empty without classes."""
+        if not self._roots:
+            return np.zeros(0, int)
+        nodes, _, owner, span = self.primitives(size)
+        kinds, lengths = np.full(len(self.names), -1), np.zeros(len(self.names))
+        for number, (kind, length) in self._roots.items():
+            kinds[number], lengths[number] = kind, length
+        if size == 2:
+            starts = span[:, 0]
+        elif size == 1:
+            starts = self._arc_lengths(owner * len(self.points) + nodes[:, 0])
+        else:
+            return np.full(len(owner), -1)
+        return np.where(starts < lengths[owner], kinds[owner], -1)
+
+    def _arc_lengths(self, keys: np.ndarray) -> np.ndarray:
+        """Return the arc lengths [m] of nodes of edges, by keys: object times all nodes + node; infinite for nodes of no edge."""
+        ends, _, owners, span = self.primitives(2)
+        every = (owners * len(self.points) + ends.T)[
+            ::-1
+        ].ravel()  # of a node of two edges the start of the second counts
+        order = np.argsort(every, kind="stable")
+        index = np.searchsorted(every[order], keys, side="right") - 1
+        match = (index >= 0) & (every[order][index] == keys)
+        return np.where(match, span[:, 1::-1].T.ravel()[order][index], np.inf)
+
     @property
     def body_rotations(self) -> np.ndarray:
         """Rotation blocks of objects that are surfaces of rigid bodies, -1 for others (objects,)."""
@@ -174,8 +212,10 @@ class CollisionMesh:
 
     @property
     def ignored(self) -> np.ndarray:
-        """Keys of pairs of objects (smaller number times all objects + larger), sorted."""
-        return np.array(sorted(a * len(self.names) + b for a, b in self.ignored_pairs), np.int64)
+        """Keys of pairs of objects (smaller number times all objects + larger), and of classes of roots and objects, sorted."""
+        count = len(self.names)
+        pairs = [a * count + b for a, b in self.ignored_pairs]
+        return np.array(sorted(pairs + [(count + kind) * count + b for kind, b in self.roots_ignored]), np.int64)
 
     @property
     def sizes(self) -> list[int]:

@@ -46,7 +46,7 @@ class ContactDiagnosis:
                 meet = f"are {gap:.3g} m apart, too close for a barrier, which needs {least:.3g} m,"
             raise SceneError(
                 f"contact: {pair} {meet} at the start; separate them, as model.resolve_overlaps(state) does, give "
-                "them a smaller radius, or exclude the pair by contact_between(..., ignore=True)"
+                "them a smaller radius, or exclude the pair by contact_between(..., ignore=True), or the roots of rods by root_length"
             )
 
     def closest_pair(self, x: wp.array, reason: int) -> str:

@@ -3,6 +3,7 @@
 import numpy as np
 import warp as wp
 
+from ddg_warp.compile.collision_bodies import ROD
 from ddg_warp.kernels.collision.contact.query import query_kernel
 from ddg_warp.scene.obstacles import BALL, CAPSULE, MESH, PLANE
 from ddg_warp.solve.collision.broad_phase import BroadPhase
@@ -206,6 +207,12 @@ def shapes_of(host) -> CollisionMesh:
         for first in np.flatnonzero(contact_parameters.group == g):
             for second in np.flatnonzero(contact_parameters.group == h):
                 shapes.ignore(int(first), int(second))
+    for kind, (g, (length, partners)) in enumerate(sorted(contact_parameters.roots.items())):
+        for number in np.flatnonzero(contact_parameters.group == g):
+            if contact_parameters.bodies[number].kind == ROD:
+                shapes.root(int(number), kind, length)
+        for number in np.flatnonzero(np.isin(contact_parameters.group, partners)):
+            shapes.ignore_root(kind, int(number))
     return shapes
 
 
