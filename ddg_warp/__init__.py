@@ -5,8 +5,8 @@
     for _ in range(100): state = integrator.step(state, dt=0.01)
 
 Describe a scene: `Scene`, `Circle`, `Ellipse`, `Rectangle`, `Ribbon`, `Stiffness`, `Material`, `Law`.
-Supports, motions, controls: `Motion`, `Grip`, `Controls`, `Samples`.
-Obstacles, fluid: `Plane`, `Sphere`, `Capsule`, `Box`, `Mesh`, `Viscous`, `Granular`.
+Supports, motions, controls: `Motion`, `FrameMotion`, `Grip`, `Controls`, `Samples`.
+Obstacles, fluid: `Plane`, `Sphere`, `Capsule`, `Box`, `Mesh`, `AnimatedMesh`, `Viscous`, `Granular`.
 Run it: `simulate`, `Dynamics`, `Statics`, `PathAnalysis`, `StopCriterion`, `Displacement`, `Check`, `Recorder`, `bench`.
 See it: `Viewer`, `movie`.
 Loops: `Integrator`, `AdaptiveStepper`, `statics`, `continuation`, `stability`.
@@ -40,11 +40,13 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time see `_HOME`
     from ddg_warp.run.movie import movie
     from ddg_warp.run.recorder import Recorder
     from ddg_warp.run.simulate import simulate
+    from ddg_warp.scene.animated_mesh import AnimatedMesh
     from ddg_warp.scene.descriptions import Dynamics, PathAnalysis, Statics
     from ddg_warp.scene.drag import Granular, QuadraticDrag, Viscous
     from ddg_warp.scene.equilibrium_path import Displacement, StopCriterion
     from ddg_warp.scene.field import Samples
     from ddg_warp.scene.flow import FlowGrid, Gust, Turbulence
+    from ddg_warp.scene.frame_motion import FrameMotion
     from ddg_warp.scene.grip import Grip
     from ddg_warp.scene.law import Law
     from ddg_warp.scene.material import Circle, Ellipse, Material, Rectangle, Ribbon, Stiffness
@@ -60,6 +62,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time see `_HOME`
 __version__ = "0.2.0"
 __all__ = [
     "AdaptiveStepper",
+    "AnimatedMesh",
     "Box",
     "Capsule",
     "Check",
@@ -69,6 +72,7 @@ __all__ = [
     "Dynamics",
     "Ellipse",
     "FlowGrid",
+    "FrameMotion",
     "Granular",
     "Grip",
     "Gust",
@@ -114,6 +118,7 @@ __all__ = [
 ]
 
 _HOME = {
+    "AnimatedMesh": "scene.animated_mesh",
     "Box": "scene.obstacles",
     "Capsule": "scene.obstacles",
     "Check": "run.check",
@@ -123,6 +128,7 @@ _HOME = {
     "Dynamics": "scene.descriptions",
     "Ellipse": "scene.material",
     "FlowGrid": "scene.flow",
+    "FrameMotion": "scene.frame_motion",
     "Granular": "scene.drag",
     "Grip": "scene.grip",
     "Gust": "scene.flow",

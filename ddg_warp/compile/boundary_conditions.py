@@ -56,9 +56,11 @@ def fix_rods(scene, storage: DofStorage, claims: "ConstraintRegistry") -> None:
             last, twisted = support.end == "last", rows[places.twist[rows]]
             nodes += [places.nodes(rows, k) for k in ((places.own[rows] - 1, places.own[rows]) if last else (0, -1))]
             angles.append(places.angles(twisted, places.own[twisted] - 1 if last else -1))
+        twisted_owners = np.tile(positions[places.twist[rows]], len(angles))
         owners = np.tile(positions, len(nodes))
         nth = owners * len(support.nodes) + np.repeat(np.arange(len(nodes)), len(positions))
-        claims.take(support, np.concatenate([_NONE, *nodes]), nth, owners, np.concatenate([_NONE, *angles]))
+        angles = np.concatenate([_NONE, *angles])
+        claims.take(support, np.concatenate([_NONE, *nodes]), nth, owners, angles, twisted_owners)
 
 
 class ConstraintRegistry:
@@ -76,10 +78,19 @@ class ConstraintRegistry:
         self._moved = {}  # (motion, components named) by number of the support
         self._claims = []  # (indices, components, poses, number, owners) of each support
 
-    def take(self, support, nodes: np.ndarray, nth: np.ndarray, owners: np.ndarray, angles: np.ndarray = _NONE) -> None:
+    def take(
+        self,
+        support,
+        nodes: np.ndarray,
+        nth: np.ndarray,
+        owners: np.ndarray,
+        angles: np.ndarray = _NONE,
+        angle_owners: np.ndarray = _NONE,
+    ) -> None:
         """Fix nodes along the components of a support, and twist angles; `nth` numbers the nodes of the support.
 
-        `owners` are the rods for which nodes are named: joined rods may each displace a common node, and the last counts.
+        `owners` are the rods, counted in the support, for which nodes are named: joined rods may each displace a common node, and the
+        last counts. `angle_owners` are the rods of angles.
         """
         storage, motion = self.storage, support.motion
         along = [d for d in range(3) if "xyz"[d] in support.components]
@@ -89,7 +100,9 @@ class ConstraintRegistry:
         storage.held.append(Held(places, components) if along else Held(nodes, 0 * nodes, support.normal))
         if self.motions:
             poses = np.full(len(places), STILL if motion is None else self._start[id(motion)])
-            if motion is not None and motion.count is not None:
+            if motion is not None and motion.by_rod:
+                poses += np.concatenate([np.tile(owners, len(along)), angle_owners])
+            elif motion is not None and motion.count is not None:
                 poses += np.tile(nth, len(along))  # such a motion rotates no edge
             self._moved[len(storage.held)] = motion, along
             stored = np.isin(components, storage.axes)

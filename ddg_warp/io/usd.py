@@ -26,9 +26,11 @@ from ddg_warp import argument_checks
 from ddg_warp.io.bodies import Bodies
 from ddg_warp.io.colors import PALETTE
 from ddg_warp.io.contact_records import Contacts, ContactScales
+from ddg_warp.io.curves import CurveSet
 from ddg_warp.io.obstacles import Obstacles
 from ddg_warp.io.paths import CurveError
 from ddg_warp.io.shapes import Curves, Shapes
+from ddg_warp.io.usd_animated_mesh import read_animated_mesh
 from ddg_warp.io.usd_bodies import BodyPrim
 from ddg_warp.io.usd_check import validate
 from ddg_warp.io.usd_contact import ContactsPrim, ObstaclePrim
@@ -36,8 +38,9 @@ from ddg_warp.io.usd_groom import Groom, open_groom
 from ddg_warp.io.usd_groom_layer import GroomLayer
 from ddg_warp.io.usd_prims import ColorBy, CurvesPrim, Frame, PointsPrim, SurfacePrim, TubesPrim
 from ddg_warp.io.usd_read import read_curves
+from ddg_warp.typing import Array, FilePath, Floats, Numbers
 
-__all__ = ["CurvesWriter", "Groom", "GroomLayer", "open_groom", "read_curves", "validate"]
+__all__ = ["CurvesWriter", "Groom", "GroomLayer", "open_groom", "read_animated_mesh", "read_curves", "validate"]
 
 ROOM = 2**16  # bytes of overhead of a save
 TABLE = 256  # largest table entry for a frame of a prim [bytes]
@@ -64,15 +67,15 @@ class CurvesWriter:
 
     def __init__(
         self,
-        path,
-        curves,
+        path: FilePath,
+        curves: CurveSet | Shapes,
         *,
         fps: float = 24.0,
-        colors=None,
+        colors: Numbers | None = None,
         color_by: tuple[str, float, float] | None = None,
         tube: bool = False,
         block: int = 32,
-        attributes: Mapping[str, np.ndarray] | None = None,
+        attributes: Mapping[str, Array] | None = None,
         obstacles: Obstacles | None = None,
         contact_scales: ContactScales | None = None,
         bodies: Bodies | None = None,
@@ -120,20 +123,20 @@ class CurvesWriter:
     def __enter__(self) -> CurvesWriter:
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def write(
         self,
         time: float,
-        points,
+        points: Numbers,
         *,
-        velocities=None,
-        scalars: Mapping[str, np.ndarray] | None = None,
-        triangle_scalars: Mapping[str, np.ndarray] | None = None,
-        obstacles: np.ndarray | None = None,
+        velocities: Numbers | None = None,
+        scalars: Mapping[str, Floats] | None = None,
+        triangle_scalars: Mapping[str, Floats] | None = None,
+        obstacles: Floats | None = None,
         contacts: Contacts | None = None,
-        body_poses: np.ndarray | None = None,
+        body_poses: Floats | None = None,
     ) -> None:
         """Write a frame.
 

@@ -7,12 +7,13 @@ from pxr import Usd, UsdGeom, UsdPhysics
 
 from ddg_warp.io.paths import CurveError, MissingFileError, existing
 from ddg_warp.io.usd_read import opened
+from ddg_warp.typing import FilePath
 
 EXTENT_SLACK = 1e-5  # of the extent's size: positions and extents are float32
 RIGID_SLACK = 1e-5  # of entries of R R^T: quaternions may be float32
 
 
-def validate(path, outside: bool = False) -> list[str]:
+def validate(path: FilePath, outside: bool = False) -> list[str]:
     """Return the problems of a USD file, one sentence each; empty for a valid file.
 
     USD's own validators run if the installed USD has them. In addition every time sample of every BasisCurves and Mesh is checked.

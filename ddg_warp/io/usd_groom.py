@@ -7,6 +7,7 @@ Linear curves have their vertices as nodes. Instances of the scene graph are exp
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +20,7 @@ from ddg_warp.io import cubic
 from ddg_warp.io.curves import CurveSet, checked_curves
 from ddg_warp.io.paths import CurveError, existing
 from ddg_warp.io.usd_read import FINER, opened, placement, shapes_below, splines
+from ddg_warp.typing import Array, Bools, FilePath, Floats, Integers, Names
 
 FLOOR = 0.1  # least radius of a node over the largest of its strand
 SAMPLINGS = ("interpolating", "vertices")
@@ -52,7 +54,7 @@ class Primvar:
         element_size: Number of values of an element.
     """
 
-    values: np.ndarray
+    values: Array
     interpolation: str
     element_size: int = 1
 
@@ -78,9 +80,9 @@ class GroomPrim:
     type: str
     basis: str
     wrap: str
-    counts: np.ndarray
-    vertices: np.ndarray
-    curves: np.ndarray
+    counts: Integers
+    vertices: Floats
+    curves: Integers
     primvars: dict[str, Primvar]
     widths: Primvar | None
     purpose: str
@@ -95,7 +97,7 @@ class GroomPrim:
         return self.wrap == UsdGeom.Tokens.periodic
 
     @cached_property
-    def read(self) -> np.ndarray:
+    def read(self) -> Bools:
         """Mask of the vertices of curves that are read, shape (V,)."""
         return np.repeat(np.isin(np.arange(len(self.counts)), self.curves), self.counts)
 
@@ -105,7 +107,7 @@ class GroomPrim:
         varying = int(self.sampled.knot_counts.sum() + skipped)
         return {"constant": 1, "uniform": len(self.counts), "varying": varying, "vertex": len(self.vertices)}
 
-    def at_nodes(self, primvar: Primvar) -> np.ndarray:
+    def at_nodes(self, primvar: Primvar) -> Array:
         """Return the values of a primvar at the nodes of strands, shape (P, ...); whole numbers and texts are not blended."""
         values, kind = primvar.values, primvar.interpolation
         if kind == UsdGeom.Tokens.constant:
@@ -152,9 +154,9 @@ class Groom:
     outside: bool
     prims: list[GroomPrim]
     samples: str | int
-    points: np.ndarray
-    radius: np.ndarray | None
-    error: np.ndarray
+    points: Floats
+    radius: Floats | None
+    error: Floats
     start: float
     end: float
     rate: float
@@ -166,35 +168,35 @@ class Groom:
         return f"<Groom of {len(self.counts)} strands of {len(self.points)} nodes in {', '.join(p.path for p in self.prims)}>"
 
     @cached_property
-    def counts(self) -> np.ndarray:
+    def counts(self) -> Integers:
         """Nodes of each strand, shape (R,)."""
         return np.concatenate([prim.sampled.counts for prim in self.prims])
 
     @property
-    def closed(self) -> np.ndarray:
+    def closed(self) -> Bools:
         """Mask of closed strands, shape (R,)."""
         return np.repeat([prim.closed for prim in self.prims], [len(prim.curves) for prim in self.prims])
 
     @property
-    def names(self) -> np.ndarray:
+    def names(self) -> Names:
         """Name of the prim of each strand, shape (R,)."""
         names = [prim.path.rpartition("/")[2] for prim in self.prims]
         return np.repeat(names, [len(prim.curves) for prim in self.prims])
 
     @property
-    def ids(self) -> np.ndarray:
+    def ids(self) -> Array:
         """Id of each strand, shape (R,): the primvar of `IDS` that the file has, or the index."""
         name = self._first_of(IDS)
         return self.of_strands(name) if name else np.arange(len(self.counts))
 
     @property
-    def groups(self) -> np.ndarray:
+    def groups(self) -> Array:
         """Group of each strand, shape (R,): the primvar of `GROUPS` that the file has, or the name of the prim."""
         name = self._first_of(GROUPS)
         return self.of_strands(name) if name else self.names
 
     @property
-    def guides(self) -> np.ndarray:
+    def guides(self) -> Bools:
         """Mask of guides, shape (R,), by a primvar of `GUIDES`, or of prims of purpose "guide"."""
         name = self._first_of(GUIDES)
         if name:
@@ -207,7 +209,7 @@ class Groom:
         """Time from the first time code to the last [s]."""
         return (self.end - self.start) / self.rate
 
-    def rods(self) -> list[np.ndarray]:
+    def rods(self) -> list[Floats]:
         """Return the nodes of each strand [m], each of shape (n, 3)."""
         return np.split(self.points, np.cumsum(self.counts)[:-1])
 
@@ -218,7 +220,7 @@ class Groom:
         where = self.prims[0].path
         return CurveSet(self.points, self.counts, self.closed, self.radius, where, attributes)
 
-    def of_strands(self, name: str) -> np.ndarray:
+    def of_strands(self, name: str) -> Array:
         """Return a uniform or constant primvar of all strands, shape (R, ...).
 
         Raises:
@@ -235,7 +237,7 @@ class Groom:
             result.append(primvar.values[rows])
         return np.concatenate(result)
 
-    def at_nodes(self, name: str) -> np.ndarray:
+    def at_nodes(self, name: str) -> Array:
         """Return a primvar at all nodes, shape (P, ...), of any interpolation.
 
         Raises:
@@ -243,7 +245,7 @@ class Groom:
         """
         return np.concatenate([prim.at_nodes(primvar) for prim, primvar in self._each(name)])
 
-    def _each(self, name: str):
+    def _each(self, name: str) -> Iterator[tuple[GroomPrim, Primvar]]:
         for prim in self.prims:
             if name not in prim.primvars:
                 raise CurveError(
@@ -259,7 +261,9 @@ class Groom:
         return ""
 
 
-def open_groom(path, prim: str | None = None, *, samples: str | int = "interpolating", outside: bool = False) -> Groom:
+def open_groom(
+    path: FilePath, prim: str | None = None, *, samples: str | int = "interpolating", outside: bool = False
+) -> Groom:
     """Read the curves of a prim, or of all prims below it, at the first time code of the stage.
 
     Invisible prims and prims of purpose "guide" or "proxy" are read if `prim` names them, and listed as unread otherwise. Curves of

@@ -19,6 +19,7 @@ from ddg_warp.io.paths import CurveError, as_path
 from ddg_warp.io.usd_groom import Groom, GroomPrim
 from ddg_warp.io.usd_prims import vectors
 from ddg_warp.io.usd_read import placement
+from ddg_warp.typing import FilePath, Numbers
 
 SUFFIXES = (".usd", ".usda", ".usdc")
 RATE_STEP = 1e-3  # time codes, step of the differences of transforms
@@ -45,7 +46,7 @@ class GroomLayer:
         CurveError: The path is the groom's own or has another suffix; or curves have too few nodes to find their vertices.
     """
 
-    def __init__(self, groom: Groom, path):
+    def __init__(self, groom: Groom, path: FilePath):
         self.groom, self.path, self.error = groom, as_path("GroomLayer: path", path, CurveError), 0.0
         if self.path.suffix.lower() not in SUFFIXES:
             raise CurveError(f"{path}: a layer is a {', '.join(SUFFIXES)} file; give it one of these suffixes")
@@ -69,10 +70,10 @@ class GroomLayer:
     def __enter__(self) -> GroomLayer:
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
-    def write(self, time: float, points, velocities=None) -> None:
+    def write(self, time: float, points: Numbers, velocities: Numbers | None = None) -> None:
         """Write the nodes of all strands at a time.
 
         Args:

@@ -27,6 +27,7 @@ from ddg_warp.io.faces import corners_of, triangulated
 from ddg_warp.io.file_mesh import FileMesh
 from ddg_warp.io.paths import CurveError, MeshError, existing
 from ddg_warp.io.usd_texture import corner_texture, unread_of_mesh
+from ddg_warp.typing import FilePath
 
 LISTED = 5  # prims in a message
 SHORT = 0.01  # largest relative length error of a polyline without a warning
@@ -35,7 +36,7 @@ INSTANCES = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
 DRAWN = ("displayColor", "displayOpacity", "widths", "normals", "radius")
 
 
-def read_curves(path, prim: str | None = None, samples: int = 1, outside: bool = False) -> list[CurveSet]:
+def read_curves(path: FilePath, prim: str | None = None, samples: int = 1, outside: bool = False) -> list[CurveSet]:
     """Return the curves of a USD file, one set for each BasisCurves prim, in metres with z up.
 
     Warns (`SceneWarning`) of curves other than BasisCurves, of missing referenced files, and of cubic curves with polylines more than

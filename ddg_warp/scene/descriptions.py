@@ -9,6 +9,7 @@ from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
 from ddg_warp.geometry.surface import Surface
 from ddg_warp.scene.equilibrium_path import Displacement, StopCriterion, watched_displacements
+from ddg_warp.scene.frame_motion import FrameMotion
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.law import Law
 from ddg_warp.scene.material import Material, Stiffness
@@ -147,7 +148,7 @@ class Support:
     components: str = "xyz"
     edges: tuple[int, ...] = ()
     end: str = ""
-    motion: Motion | Grip | None = None
+    motion: Motion | Grip | FrameMotion | None = None
     tangent: np.ndarray | None = None
     director: np.ndarray | None = None
     call: str = "fix"  # method of the scene, for messages

@@ -31,6 +31,7 @@ class Grip:
     count = None
     turns = True
     planar = True
+    by_rod = False
 
     def __post_init__(self):
         object.__setattr__(self, "pivot", argument_checks.vector("Grip: pivot", self.pivot))

@@ -48,6 +48,8 @@ class Motion:
     )  # number of nodes with one displacement each
     unit: Floats = field(init=False, repr=False, compare=False)
 
+    by_rod = False
+
     def __post_init__(self):
         for name in ("translation", "angle"):
             function = getattr(self, name)

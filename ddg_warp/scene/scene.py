@@ -14,6 +14,7 @@ from ddg_warp.errors import SceneError, SceneWarning
 from ddg_warp.scene import drag, validate
 from ddg_warp.scene.descriptions import Dynamics, Load, PathAnalysis, RodBatch, Statics, Support
 from ddg_warp.scene.field import Fields
+from ddg_warp.scene.frame_motion import FrameMotion
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.handle import LOAD, ROD, SHELL, SUPPORT, Handle, Handles, need
 from ddg_warp.scene.law import Law, laws_of
@@ -235,12 +236,16 @@ class Scene(Structures, RigidBodies, Fields, UserForces):
         return Handles(range(first, self.rod_count), options["name"])
 
     def clamp(
-        self, rods: Selection, edges: Selection = (0,), motion: Motion | Grip | None = None, name: str = ""
+        self,
+        rods: Selection,
+        edges: Selection = (0,),
+        motion: Motion | Grip | FrameMotion | None = None,
+        name: str = "",
     ) -> Handle:
         """Clamp edges: fix both nodes and the twist angle. The continuum clamp then lies at the middle of the edge.
 
-        Negative indices count from the last edge; a mask of bools or a slice is accepted, too. `motion` prescribes the edges; by
-        default they stay at rest. `name` is the support's in `Model.reactions`.
+        Negative indices count from the last edge; a mask of bools or a slice is accepted, too. `motion` prescribes the edges, all
+        alike or as a `FrameMotion` rod by rod; by default they stay at rest. `name` is the support's in `Model.reactions`.
         """
         rods, edges = self._on_rods("clamp", rods, "edge", edges)
         nodes = tuple(dict.fromkeys(n for e in edges for n in ((e, e + 1) if e >= 0 else (e - 1, e))))
@@ -250,7 +255,7 @@ class Scene(Structures, RigidBodies, Fields, UserForces):
         self,
         rods: Selection,
         end: End = "first",
-        motion: Motion | Grip | None = None,
+        motion: Motion | Grip | FrameMotion | None = None,
         components: str = "xyz",
         tangent: Numbers | None = None,
         director: Numbers | None = None,
@@ -297,7 +302,7 @@ class Scene(Structures, RigidBodies, Fields, UserForces):
         rods: Selection,
         nodes: Selection,
         components: str = "xyz",
-        motion: Motion | Grip | None = None,
+        motion: Motion | Grip | FrameMotion | None = None,
         name: str = "",
     ) -> Handle:
         """Fix components of nodes (a hinge). A motion may give a displacement for every node."""
@@ -305,7 +310,7 @@ class Scene(Structures, RigidBodies, Fields, UserForces):
         return self._support("fix", rods, nodes=nodes, components=components, motion=motion, name=name)
 
     def fix_twist(
-        self, rods: Selection, edges: Selection, motion: Motion | Grip | None = None, name: str = ""
+        self, rods: Selection, edges: Selection, motion: Motion | Grip | FrameMotion | None = None, name: str = ""
     ) -> Handle:
         """Fix the twist angle of edges."""
         rods, edges = self._on_rods("fix_twist", rods, "edge", edges)
@@ -462,7 +467,11 @@ class Scene(Structures, RigidBodies, Fields, UserForces):
         name = name and argument_checks.text(f"{call}: name", name)
         argument_checks.components(call, components)
         validate.check_motion(call, motion, planar=self.dimension == 2)
-        if motion is not None and motion.count is not None:
+        if motion is not None and motion.by_rod and motion.count != len(rods):
+            raise SceneError(
+                f"{call}: the motion has frames of {motion.count} rods, and there are {len(rods)}; give one for each"
+            )
+        if motion is not None and motion.count is not None and not motion.by_rod:
             if call != "fix":
                 raise SceneError(f"{call}: the motion has a displacement for each node, which rotates no edge; use fix")
             if motion.count != (count := len(rods) * len(dofs["nodes"])):

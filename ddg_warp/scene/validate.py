@@ -11,6 +11,7 @@ from ddg_warp.geometry import polyline
 from ddg_warp.scene import edge_forces
 from ddg_warp.scene.contact import check_contact
 from ddg_warp.scene.descriptions import Dynamics, PathAnalysis, Statics, supports_of
+from ddg_warp.scene.frame_motion import FrameMotion
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.prescribed_motion import Motion
 
@@ -58,7 +59,7 @@ def check_scene(scene) -> None:
         laws.check(scene)
     _check_magnets(scene)
     check_contact(scene)
-    supports = [s for s in supports_of(scene) if isinstance(s.motion, Motion)]  # a grip starts at rest
+    supports = [s for s in supports_of(scene) if isinstance(s.motion, Motion | FrameMotion)]  # a grip starts at rest
     if not supports or scene.initial is not None or not isinstance(scene.analysis, Dynamics):
         return  # an initial state may be displaced, and equilibria have no initial time
     objects = [*scene.batches, *scene.shells, *scene.axisymmetric_shells]
@@ -102,8 +103,12 @@ def _check_magnets(scene) -> None:
 
 def check_motion(call: str, motion, planar: bool) -> None:
     """Refuse an object that is no motion, or a rotation out of the plane of x and z if `planar`."""
-    if motion is not None and not isinstance(motion, Motion | Grip):
+    if motion is not None and not isinstance(motion, Motion | Grip | FrameMotion):
         raise SceneError(f"{call}: motion is {motion!r}; give Motion(translation=..., angle=...) or Grip(pivot=...)")
+    if motion is not None and motion.by_rod and call not in ("clamp", "clamp_end", "fix", "fix_twist"):
+        raise SceneError(
+            f"{call}: the motion has a frame for each rod; it moves rods alone, by clamp, clamp_end or fix"
+        )
     if motion is not None and planar and not motion.planar:
         raise SceneError(
             f"{call}: the motion rotates about {tuple(motion.axis)}, out of the plane of x and z; give axis=(0, 1, 0)"

@@ -52,6 +52,14 @@ def build_pair(*names, **options):
     return built(made)
 
 
+def _two_roots():
+    """Build rods with a root length for each of two partners."""
+    made = obstructed(ddg.Plane((0.0, 0.0, -1.0)), name="floor")
+    for partner, length in (("floor", 0.1), ("odd", 0.2)):
+        made.contact_between("rod", partner, root_length=length)
+    return built(made)
+
+
 for _name, _unit in (("range", "[m]"), ("stiffness", "[N/m]"), ("velocity", "[m/s]")):
     each("contact", _name, [0.0, -1.0, NAN, INF, "large", (1.0, 2.0)], lambda v, name=_name: in_contact(**{name: v}),
          f"contact: {_name}", "positive", _unit)
@@ -95,6 +103,12 @@ each("contact", "friction by direction of two", [("rod", "odd"), ("odd", "odd")]
 each("contact", "between stiffness", [0.0, -1.0, NAN, "hard"], lambda v: build_pair("rod", "odd", stiffness=v),
      "'rod' and 'odd'", "stiffness")
 each("contact", "between range", [0.0, -1.0, NAN, "far"], lambda v: build_pair("rod", "odd", range=v), "'rod' and 'odd'", "range")
+each("contact", "root length", [0.0, -1.0, NAN, "far"], lambda v: build_pair("rod", "floor", root_length=v), "'rod' and 'floor'",
+     "root_length", "[m]")
+refuse("contact", {
+    "roots of a floor": (lambda: build_pair("floor", "rod", root_length=0.1), "'floor' and 'rod'", "of rods", "name rods first"),
+    "two lengths of roots": (_two_roots, "'rod' and 'odd'", "0.2, and 0.1", "give one length"),
+})
 GAPS = [0.0, -1.0, NAN, "far"]
 each("contact", "gap to push apart to", GAPS, lambda v: separate(in_contact(), v), "resolve_overlaps: gap", "positive")
 refuse("contact", {
@@ -106,6 +120,29 @@ refuse("contact", {
 
 each("obstacles", "shape", [None, ddg.Plane, "plane", 3], obstructed,
      "add_obstacle 'obstacle'", "give Plane, Sphere, Capsule, Box or Mesh")
+ONE = (np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([[0, 1, 2]]))
+
+
+UNTURNED = np.eye(3)
+
+
+def _frames(count: int, shift=0.0, turn=UNTURNED):
+    """Return a motion of rods by constant frames."""
+    return ddg.FrameMotion(np.zeros((count, 3)), lambda t: (np.full((count, 3), shift), np.tile(turn, (count, 1, 1))))
+
+
+refuse("roots", {
+    "frames of two rods for one": (lambda: scene().clamp(0, motion=_frames(2)), "clamp", "frames of 2 rods", "there are 1"),
+    "frames of an obstacle": (lambda: obstructed(ddg.Plane(), motion=_frames(1)), "add_obstacle", "Motion"),
+    "frames that start displaced": (lambda: built(scene(), lambda s: s.clamp(0, motion=_frames(1, 1.0))), "t = 0 is (1.0, 1.0, 1.0)"),
+    "frames that are no number": (lambda: _frames(1, NAN), "FrameMotion: translations at t = 0 of rod 0", "finite"),
+    "frames of another shape": (lambda: _frames(1, turn=np.eye(2)), "FrameMotion: rotations", "(1, 2, 2)", "give (1, 3, 3)"),
+    "frames that are no function": (lambda: ddg.FrameMotion(np.zeros((1, 3)), 3.0), "FrameMotion: frames is 3.0", "function"),
+    "an animation that runs back": (lambda: ddg.AnimatedMesh([1.0, 0.0], np.stack([ONE[0]] * 2), ONE[1]), "times do not increase"),
+    "an animation with a frame too few": (lambda: ddg.AnimatedMesh([0.0, 1.0], ONE[0][None], ONE[1]), "(1, 3, 3)", "(frames,)"),
+    "an animation with nan": (lambda: ddg.AnimatedMesh([0.0], NAN * ONE[0][None], ONE[1]), "frame 0", "not finite"),
+    "roots that are no points": (lambda: ddg.AnimatedMesh([0.0], ONE[0][None], ONE[1]).bind([[0.0, 1.0]]), "bind: roots", "(1, 2)"),
+})
 each("obstacles", "motion", ["up", 3.0, len], lambda v: obstructed(ddg.Plane(), motion=v), "add_obstacle", "Motion")
 each("obstacles", "name", [3, "", None], lambda v: obstructed(ddg.Plane(), name=v), "add_obstacle: name", "text")
 each("obstacles", "point", [(0.0, 0.0), NAN, "here", (0.0, 0.0, INF)], ddg.Plane, "Plane: point", "three finite numbers")

@@ -153,6 +153,8 @@ def _largest_rotations(swept: Swept, allowed: np.ndarray) -> np.ndarray | None:
     """Return the largest rotation of a substep (worlds,) of a function of time; None for grips, or if nothing can meet the surface."""
     if isinstance(swept.motion, Grip) or not np.isfinite(allowed).any():
         return None
+    if swept.motion.by_rod:  # chords of nodes are sufficient
+        return np.full(len(allowed), np.inf)
     return np.array([largest_rotation(swept, each, swept.motion.unit) for each in allowed])
 
 
@@ -202,6 +204,9 @@ def _chords(swept: Swept, t0: float, t1: float, level: int) -> tuple[float, floa
     """
     motion, count = swept.motion, 2**level
     times = (t0 + (t1 - t0) * (np.arange(count)[:, None] + TIMES) / count).ravel().tolist()
+    if motion.by_rod:
+        path = np.stack([motion.place(t, swept.points, swept.rows) for t in times])
+        return _sagitta(path.reshape(count, len(TIMES), -1, 3), alone=True), 0.0
     angles = np.array([motion.angle(t) for t in times] if motion.turns else [0.0] * len(times), float)
     # the angle alone counts revolutions between two samples
     turn = float(np.ptp(angles.reshape(count, -1), axis=-1).max())
@@ -211,14 +216,19 @@ def _chords(swept: Swept, t0: float, t1: float, level: int) -> tuple[float, floa
     if motion.count is not None:
         shifts = shifts[:, swept.rows]
     positions = shifts + _rotated(motion.unit, angles, swept.arms) if turn else shifts
-    path = positions.reshape(count, len(TIMES), -1, 3)
+    # a rigid body moves along its chords as a whole
+    return _sagitta(positions.reshape(count, len(TIMES), -1, 3), alone=motion.count is not None), turn
+
+
+def _sagitta(path: np.ndarray, alone: bool) -> float:
+    """Return the largest distance [m] of paths (intervals, times, P, 3) from their chords, for points `alone` or as a rigid body."""
     path = path - path[:, :1]
     chord = path[:, -1:]
     along, square = (path * chord).sum(-1, keepdims=True), (chord * chord).sum(-1, keepdims=True)
-    if motion.count is None:  # a rigid body moves along its chords as a whole
+    if not alone:
         along, square = along.sum(-2, keepdims=True), square.sum(-2, keepdims=True)
     weight = np.clip(along / np.where(square > 0.0, square, 1.0), 0.0, 1.0)
-    return float(np.sqrt(np.square(path - weight * chord).sum(-1).max())), turn
+    return float(np.sqrt(np.square(path - weight * chord).sum(-1).max()))
 
 
 def _rotated(axis: np.ndarray, angles: np.ndarray, arms: np.ndarray) -> np.ndarray:

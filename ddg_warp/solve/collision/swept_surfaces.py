@@ -59,6 +59,10 @@ def swept_surfaces(model) -> list[Swept]:
             for some in (supported & moved, supported)
         )
         carried = np.append((mine > 1) & (mine == all_held), False)[ccd_body]
+        if motion.by_rod:  # all nodes of a rod have the row of its support
+            row_of = np.zeros(num_ccd_bodies + 1, int)
+            row_of[ccd_body[moved]] = rows[moved]
+            rows = np.where(moved, rows, row_of[ccd_body])
         moved_nodes = [
             (b, body.nodes[(moved | carried)[body.nodes]]) for b, body in enumerate(host.contact_parameters.bodies)
         ]
