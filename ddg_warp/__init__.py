@@ -11,7 +11,7 @@ Run it: `simulate`, `Dynamics`, `Statics`, `PathAnalysis`, `StopCriterion`, `Dis
 See it: `Viewer`, `movie`.
 Loops: `Integrator`, `AdaptiveStepper`, `statics`, `continuation`, `stability`.
 Query it: `Model`, `State`, `quantities`.
-Geometry, files: `meshes`, `rest_shapes`, `io`, `read_mesh`, `read_curves`, `usd`.
+Geometry, files: `meshes`, `rest_shapes`, `io`, `read_mesh`, `read_curves`, `usd`, `simulate_groom`, `groom_scene`.
 Learn: `Simulator` (torch), `ddg_warp.torch`, `ddg_warp.data`, `ddg_warp.rl`.
 Robots: `ddg_warp.coupling` (MuJoCo).
 Errors: `SceneError`, `SolverError`, `SceneWarning`.
@@ -37,6 +37,7 @@ if TYPE_CHECKING:  # for editors and type checkers; at run time see `_HOME`
     from ddg_warp.postprocess import quantities
     from ddg_warp.run import bench
     from ddg_warp.run.check import Check
+    from ddg_warp.run.groom import groom_scene, simulate_groom
     from ddg_warp.run.movie import movie
     from ddg_warp.run.recorder import Recorder
     from ddg_warp.run.simulate import simulate
@@ -104,6 +105,7 @@ __all__ = [
     "Viscous",
     "bench",
     "continuation",
+    "groom_scene",
     "io",
     "meshes",
     "movie",
@@ -112,6 +114,7 @@ __all__ = [
     "read_mesh",
     "rest_shapes",
     "simulate",
+    "simulate_groom",
     "stability",
     "statics",
     "usd",
@@ -159,7 +162,9 @@ _HOME = {
     "Viewer": "view.live",
     "Viscous": "scene.drag",
     "movie": "run.movie",
+    "groom_scene": "run.groom",
     "simulate": "run.simulate",
+    "simulate_groom": "run.groom",
     "read_curves": "io:read",
     "read_mesh": "io.mesh_read",
     "Simulator": "torch",

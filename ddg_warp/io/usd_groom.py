@@ -20,6 +20,7 @@ from ddg_warp.io import cubic
 from ddg_warp.io.curves import CurveSet, checked_curves
 from ddg_warp.io.paths import CurveError, existing
 from ddg_warp.io.usd_read import FINER, opened, placement, shapes_below, splines
+from ddg_warp.scene.frame_motion import FrameMotion
 from ddg_warp.typing import Array, Bools, FilePath, Floats, Integers, Names
 
 FLOOR = 0.1  # least radius of a node over the largest of its strand
@@ -527,3 +528,36 @@ def _instances(prim: Usd.Prim) -> tuple[str, ...]:
         return ()
     ancestors = [prim.GetStage().GetPrimAtPath(path) for path in prim.GetPath().GetPrefixes()]
     return tuple(str(each.GetPath()) for each in ancestors if each.IsInstance())
+
+
+def prim_motion(groom: Groom, roots: np.ndarray, strands: np.ndarray) -> FrameMotion | None:
+    """Return the motion of roots (n, 3) [m] of some strands (n,) with the transforms of their prims; None if all stay."""
+    stage = Usd.Stage.Open(str(groom.path))
+    curves = [UsdGeom.BasisCurves(stage.GetPrimAtPath(prim.path)) for prim in groom.prims]
+    owner = np.repeat(np.arange(len(curves)), [len(prim.curves) for prim in groom.prims])[strands]
+    if not any(_moves(each.GetPrim()) for each in curves):
+        return None
+
+    def matrices(t: float) -> np.ndarray:
+        code = Usd.TimeCode(groom.start + t * groom.rate)
+        return np.stack([placement(each, code, str(groom.path), CurveError)[0] for each in curves])
+
+    back = np.linalg.inv(matrices(0.0))
+
+    def frames(t: float) -> tuple[np.ndarray, np.ndarray]:
+        moved = (back @ matrices(t))[owner]
+        u, _, v = np.linalg.svd(moved[:, :3, :3].swapaxes(1, 2))
+        rotation = u @ v
+        rotation *= np.sign(np.linalg.det(rotation))[:, None, None]
+        return np.einsum("ni,nij->nj", roots, moved[:, :3, :3]) + moved[:, 3, :3] - roots, rotation
+
+    return FrameMotion(roots, frames)
+
+
+def _moves(prim: Usd.Prim) -> bool:
+    """Return True if the transform of a prim or of an ancestor changes with time."""
+    while prim:
+        if prim.IsA(UsdGeom.Xformable) and UsdGeom.Xformable(prim).TransformMightBeTimeVarying():
+            return True
+        prim = prim.GetParent()
+    return False

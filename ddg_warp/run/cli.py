@@ -1,4 +1,4 @@
-"""The command line: `ddg-warp run | view | sweep | list | check | gradients | bench | export | warmup | info | docs |
+"""The command line: `ddg-warp run | view | sweep | groom | list | check | gradients | bench | export | warmup | info | docs |
 completion`.
 
 Exit codes: 0 done, 1 a check or the solver failed, 2 invalid input, 130 interrupted, 141 broken pipe.
@@ -77,6 +77,7 @@ def _of_location(error: Exception) -> Exception:
 def parser(arguments: list[str]) -> Parser:
     """Build the parser; `run SCENE`, `sweep SCENE` and `bench SCENE` add the flags of the scene."""
     from ddg_warp.data import sweep_command as command
+    from ddg_warp.run import groom_command
 
     top = Parser(prog="ddg-warp", description="Simulate flexible slender structures on NVIDIA Warp.")
     commands = top.add_subparsers(metavar="COMMAND", required=True)
@@ -129,6 +130,11 @@ def parser(arguments: list[str]) -> Parser:
     if arguments[:1] == ["sweep"] and len(arguments) > 1 and not arguments[1].startswith("-"):
         group = sweep.add_argument_group(f"parameters of {arguments[1]}, for all samples")
         add_parameters(group, load_scene(arguments[1]), leave=command.FLAGS)
+
+    hair = commands.add_parser("groom", help="simulate the curves of a USD file, into a layer over it")
+    hair.set_defaults(command=groom_file)
+    groom_command.add_flags(hair)
+    add_settings(hair)
 
     show = commands.add_parser("list", help="list scenes and terms")
     show.set_defaults(command=list_all)
@@ -248,6 +254,14 @@ def run_scene(chosen: argparse.Namespace) -> int:
             movie(directory, chosen.movie, title=name)
     say(result, directory)
     return FAILED if result.failure or any(check.failed for check in result.checks) else DONE
+
+
+def groom_file(chosen: argparse.Namespace) -> int:
+    """Simulate a groom, and write the layer."""
+    from ddg_warp.run.groom_command import run_groom
+
+    require_device(chosen.device)
+    return run_groom(chosen)
 
 
 def finished(directory: Path, duration: float | None) -> str:
