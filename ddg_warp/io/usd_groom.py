@@ -533,13 +533,13 @@ def _instances(prim: Usd.Prim) -> tuple[str, ...]:
 def prim_motion(groom: Groom, roots: np.ndarray, strands: np.ndarray) -> FrameMotion | None:
     """Return the motion of roots (n, 3) [m] of some strands (n,) with the transforms of their prims; None if all stay."""
     stage = Usd.Stage.Open(str(groom.path))
-    curves = [UsdGeom.BasisCurves(stage.GetPrimAtPath(prim.path)) for prim in groom.prims]
-    owner = np.repeat(np.arange(len(curves)), [len(prim.curves) for prim in groom.prims])[strands]
-    if not any(_moves(each.GetPrim()) for each in curves):
+    owner = np.repeat(np.arange(len(groom.prims)), [len(prim.curves) for prim in groom.prims])[strands]
+    if not any(_moves(stage.GetPrimAtPath(prim.path)) for prim in groom.prims):
         return None
 
     def matrices(t: float) -> np.ndarray:
         code = Usd.TimeCode(groom.start + t * groom.rate)
+        curves = [UsdGeom.BasisCurves(stage.GetPrimAtPath(prim.path)) for prim in groom.prims]
         return np.stack([placement(each, code, str(groom.path), CurveError)[0] for each in curves])
 
     back = np.linalg.inv(matrices(0.0))
