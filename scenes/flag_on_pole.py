@@ -1,8 +1,8 @@
 """Flag on a pole: a wind veers and dies; the flag moves around the pole, presses against it, and hangs in folds.
 
-The hoist of the flag is sewn to a rope with fixed ends next to the pole. The wind is a uniform dead force on the cloth. It blows away
-from the pole first and rotates by 180 degrees, so that cloth and rope press against the pole. In calm air the flag falls onto itself
-and the pole. At every time the pole and the ends of the rope carry weight and inertia.
+The hoist of the flag is sewn to a rope with fixed ends next to the pole. The wind acts by quadratic drag on cloth and rope. It blows
+away from the pole first and rotates by 180 degrees, so that cloth and rope press against the pole. In calm air the flag falls onto
+itself and the pole. At every time the pole, the ends of the rope and drag carry weight and inertia.
 """
 
 import numpy as np
@@ -18,14 +18,14 @@ CLOTH = ddg.Material(young=3e5, poisson=0.3, density=300.0, viscosity=5e-3)
 POLE, ROPE = 0.02, 3e-3  # m, radii
 RANGE = 1.5e-3  # m, activation distance
 APART = POLE + ROPE + 2.0 * RANGE  # m, from the axis of the pole to the rope
+AIR = ddg.QuadraticDrag(density=1.2, normal=1.2, tangential=0.02)
 STREAMS, VEERS, BLOWS, DIES = 0.4, 1.2, 2.2, 2.4  # s, ends of the phases of the wind
 
 
 def build(
     cells: int = 16,
-    wind: float = 1.5,
+    wind: float = 10.0,
     friction: float = 0.3,
-    damping: float = 3.0,
     dt: float = 0.01,
     duration: float = 4.0,
     seed: int = -1,
@@ -34,9 +34,8 @@ def build(
 
     Args:
         cells: cells of the flag along its hoist, half as many more along its fly, of two triangles each
-        wind: force of the wind over the weight of the flag
+        wind: speed of the wind [m/s]
         friction: Coulomb friction coefficient everywhere
-        damping: mass-proportional damping by the air [1/s]
         dt: time step [s]
         duration: duration of the run [s]
         seed: seed of the initial jitter across the cloth, a tenth of the activation distance; no jitter below 0
@@ -46,7 +45,7 @@ def build(
     points = points[:, [0, 2, 1]] + [APART, 0.0, -0.5 * HEIGHT]
     hoist = np.flatnonzero(points[:, 0] < APART + 1e-9)
     start = points + 0.1 * RANGE * _many_rods.jitter((len(points), 1), seed) * [0.0, 1.0, 0.0]
-    scene = ddg.Scene(mass_damping=damping, analysis=ddg.Dynamics(dt=dt, duration=duration))
+    scene = ddg.Scene(flow=lambda t: wind * blowing(t), analysis=ddg.Dynamics(dt=dt, duration=duration))
     flag = scene.add_shell(start, triangles, thickness=THICKNESS, material=CLOTH, bending="hinge", name="flag")
     line = start[hoist[np.argsort(points[hoist, 2])]]
     cell = np.array([0.0, 0.0, HEIGHT / cells])
@@ -59,33 +58,27 @@ def build(
     )
     scene.attach(rope, range(1, len(line) + 1), flag, hoist[np.argsort(points[hoist, 2])], spin="free")
     scene.fix(rope, [0, -1])
-    for k, axis in enumerate(np.eye(3)[:2]):
-        force = shares(points, triangles)[:, None] * wind * 9.81 * CLOTH.density * THICKNESS * axis
-        scene.add_vertex_force(flag, np.arange(len(points)), force, amplitude=lambda t, k=k: float(blowing(t)[k]))
+    scene.drag(law=AIR)
     scene.add_obstacle(ddg.Capsule((0.0, 0.0, -HEIGHT), (0.0, 0.0, HEIGHT), POLE), name="pole")
     scene.contact(range=RANGE, **_many_rods.friction_options(friction, velocity=1e-2))
     return scene
 
 
-def shares(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return the area of each vertex (n,) [m^2]."""
-    a, b, c = np.moveaxis(points[triangles], 1, 0)
-    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    return np.bincount(triangles.ravel(), np.repeat(area / 3.0, 3), len(points))
-
-
 def blowing(t: float) -> np.ndarray:
-    """Return the wind vector (2,), a direction times relative strength: along x at first, against it in the end."""
+    """Return the wind vector (3,), a direction times relative strength: along x at first, against it in the end."""
     angle = np.pi * np.clip((t - STREAMS) / (VEERS - STREAMS), 0.0, 1.0)
-    return np.array([np.cos(angle), np.sin(angle)]) * np.clip((DIES - t) / (DIES - BLOWS), 0.0, 1.0)
+    return np.array([np.cos(angle), np.sin(angle), 0.0]) * np.clip((DIES - t) / (DIES - BLOWS), 0.0, 1.0)
 
 
 def observe(model, state) -> dict[str, float]:
-    """Return `_many_rods.observe` with the force on pole and rope, direction of the flag [rad], and self-contact pairs."""
+    """Return `_many_rods.observe` with the forces of pole, rope and drag, direction of the flag [rad], and self-contact pairs."""
     observed, pairs = _many_rods.observe(model, state), model.contacts(state).objects
     flag = state.points().reshape(-1, 3)[model.scene.batches[0].nodes :].mean(0)
     return observed | {
-        "carried": float(sum(np.reshape(each.force, (-1, 3))[0, 2] for each in model.reactions(state))),
+        "carried": float(
+            sum(np.reshape(each.force, (-1, 3))[0, 2] for each in model.reactions(state))
+            + model.drag(state).force.reshape(-1, 3)[:, 2].sum()
+        ),
         "direction": float(np.arctan2(flag[1], flag[0])),
         "folds": float((pairs[:, 0] == pairs[:, 1]).sum()),
     }

@@ -65,6 +65,7 @@ SMALL = {
     "post_buckling": {"n": 50},
     "pullout_cylinder": {"n": 12},
     "reach": {"n": 16},
+    "reeds": {"n": 20},
     "residual_network": {"n": 24},
     "ribbon_bistable": {"n": 40},
     "ribbon_helix": {"n": 50},

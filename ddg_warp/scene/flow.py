@@ -5,6 +5,7 @@ A field is a function `flow(points, t)` of points (n, 3) [m], or (worlds, n, 3),
 
 import inspect
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -147,7 +148,7 @@ class FlowGrid(Flow):
         grids = [(1.0 - (place - first), self.velocities[first])]
         return [*grids, (place - first, self.velocities[first + 1])] if place > first else grids
 
-    def save(self, path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write a file for `load`, HDF5 for names that end in .h5 or .hdf5, else NumPy's .npz."""
         arrays = {name: getattr(self, name) for name in NAMES if getattr(self, name) is not None}
         if _is_hdf5(path):
@@ -159,7 +160,7 @@ class FlowGrid(Flow):
             np.savez(path, **arrays)
 
     @classmethod
-    def load(cls, path) -> "FlowGrid":
+    def load(cls, path: str | Path) -> "FlowGrid":
         """Read a grid from a file of arrays "velocities", "lower", "upper" and, unless steady, "times": .npz or HDF5.
 
         Raises:
@@ -182,7 +183,7 @@ class FlowGrid(Flow):
         return cls(**arrays)
 
 
-def _is_hdf5(path) -> bool:
+def _is_hdf5(path: str | Path) -> bool:
     return str(path).endswith((".h5", ".hdf5"))
 
 
