@@ -137,6 +137,8 @@ def coupled_lines(model) -> list[str]:
         measure, density = part.term.measure.name, part.term.density.name
         lines.append(f"  {part.term.name}: {part.elements * model.worlds} elements, {measure} x {density}")
     lines += [f"  {name} on {values.shape[1]} edges of rods, implicit" for name, values in host.coefficients.items()]
+    if len(host.drag_triangles):
+        lines.append(f"  drag on {len(host.drag_triangles)} triangles of shells, implicit")
     for force in coupled.user_forces:
         kind = "all pairs of " if force.force.pairs else ""
         lines.append(
