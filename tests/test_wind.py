@@ -141,6 +141,34 @@ def test_uniform_flow_as_a_field(device, scheme):
     np.testing.assert_array_equal(*results)
 
 
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_fields_on_the_device(device, scheme):
+    """Rods of two lengths and a sheet, in two worlds, move in fields as in the same function on the host."""
+    turbulence = ddg.Turbulence((5.0, 1.0, 0.0), 0.3, 0.4, seed=2, modes=64)
+    grid = ddg.FlowGrid(
+        np.random.default_rng(1).normal(size=(3, 2, 3, 1, 3)), (-0.2, -0.2, 0.0), (1.0, 0.5, 0.0), (0.0, 0.015, 0.1)
+    )
+    field = turbulence + grid + ddg.Gust((2.0, 0.0, 0.0), duration=0.1)
+    results = []
+    for flow in (field, lambda points, t: 1.0 * field(points, t)):
+        scene = ddg.Scene(flow=flow)
+        points, triangles = meshes.rectangle(2, 2, (0.2, 0.2), "alternating")
+        scene.add_shell(points, triangles, thickness=1e-3, material=CLOTH, bending="hinge")
+        s = np.linspace(0.0, 1.0, 6)[:, None]
+        for count in (6, 5):
+            scene.add_rod(s[:count] * [1.0, 0.2, 0.1], section=ddg.Circle(0.01), material=CLOTH)
+        scene.drag(law=ddg.QuadraticDrag(RHO))
+        model = scene.build(device, "float64", worlds=2)
+        velocities = np.zeros((2, model.points_count, 3))
+        velocities[1, :, 0] = 1.0
+        integrator, state = ddg.Integrator(model, scheme), model.state(velocities=velocities)
+        for _ in range(3):
+            state = integrator.step(state, 0.01)
+        results.append((state.points(), model.drag(state).force))
+    for device_values, host_values in zip(*results, strict=True):
+        np.testing.assert_allclose(device_values, host_values, rtol=0.0, atol=1e-10)
+
+
 def test_flow_is_evaluated_where_nodes_start(device):
     """A massless rod in u = x drifts by x -> x (1 + h) each step of Euler's rule; by the midpoint rule with the mean velocity."""
     for scheme, factor in zip(SCHEMES, (1.1, 1.1), strict=True):

@@ -235,6 +235,16 @@ class CoupledModel:
         size = wp.types.type_size_in_bytes(blocks.dtype)
         return _view(blocks, blocks.dtype, (self.blocks, self.worlds), (size, size * self.blocks))
 
+    @property
+    def node_shape(self) -> tuple[int, int]:
+        """Number of dof blocks and of columns."""
+        return self.blocks, self.columns
+
+    @property
+    def node_count(self) -> wp.array:
+        """Number of nodes of every column."""
+        return wp.full(self.columns, self.host.nodes, dtype=int, device=self.device)
+
     def node_state(self, state: CoupledState):
         """Return dof blocks of a state, and their rates, for kernels over nodes."""
         result = state_type(self.nodes, self.real)()

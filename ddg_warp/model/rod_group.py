@@ -75,6 +75,16 @@ class RodGroup:
         (inputs.buffer, inputs.table), inputs.count = (table or self.parameters).arrays, self.count
         return inputs
 
+    @property
+    def node_shape(self) -> tuple[int, int]:
+        """Number of nodes of the longest rod, and of columns."""
+        return self.nodes, self.columns
+
+    @property
+    def node_count(self) -> wp.array:
+        """Number of nodes of every column."""
+        return self.count
+
     def node_state(self, state):
         """Return positions and twist angles of a state, and their rates, for kernels over nodes."""
         result = state_type(self.kind.nodes, self.parameters.arrays[0].dtype)()

@@ -22,6 +22,8 @@ NAMES = ("velocities", "lower", "upper", "times")  # of arrays in files
 
 def depends_on_position(flow) -> bool:
     """Return True if a flow is a function of position and time: one with two arguments without default."""
+    if isinstance(flow, FlowSum):
+        return any(map(depends_on_position, flow.flows))
     if not callable(flow):
         return False
     try:
@@ -32,12 +34,24 @@ def depends_on_position(flow) -> bool:
     return sum(each.kind in kinds and each.default is each.empty for each in arguments) == 2
 
 
+def terms_of(flow) -> tuple:
+    """Return the terms of a sum of flows, or the flow itself."""
+    return sum(map(terms_of, flow.flows), ()) if isinstance(flow, FlowSum) else (flow,)
+
+
+def is_on_host(flow) -> bool:
+    """Return True if a flow has a field that is a function of a user."""
+    return any(depends_on_position(each) and not isinstance(each, Turbulence | FlowGrid) for each in terms_of(flow))
+
+
 def flow_at(flow, t: float, dimension: int = 3, points: Floats | None = None, error=SolverError) -> np.ndarray:
     """Return the velocity of the fluid at t [m/s]: (3,), or of the shape of `points` if the flow depends on position.
 
     Raises:
         error: the flow has another shape, is not finite, or leaves the plane of a planar scene; names the function and the time.
     """
+    if isinstance(flow, FlowSum):
+        return sum(flow_at(each, t, dimension, points, error) for each in flow.flows)
     local = depends_on_position(flow)
     field = Field("flow", flow, None if local else 3)
     result = field.at(t, error=error, arguments=(points,) if local else ())
@@ -58,6 +72,8 @@ def flow_at(flow, t: float, dimension: int = 3, points: Floats | None = None, er
 class Flow:
     """Flow that can be added to others: a field, a function of time, or a velocity (3,)."""
 
+    __array_ufunc__ = None  # so that an array leaves the sum to `__radd__`
+
     def __add__(self, flow) -> "FlowSum":
         return FlowSum((self, flow))
 
@@ -77,10 +93,7 @@ class FlowSum(Flow):
 
     def __call__(self, points: Floats, t: float) -> Floats:
         """Return velocities at points (..., 3)."""
-        result = np.zeros(points.shape)
-        for flow in self.flows:
-            result += flow_at(flow, t, points=points)
-        return result
+        return np.zeros(points.shape) + flow_at(self, t, points=points)
 
 
 @argument_checks.called
@@ -129,24 +142,29 @@ class FlowGrid(Flow):
 
     def __call__(self, points: Floats, t: float) -> Floats:
         """Return velocities at points (..., 3)."""
-        between = [(1.0, self.velocities)] if self.times is None else self._between(t)
-        counts = np.array(between[0][1].shape[:3])
-        spans = np.where(counts > 1, self.upper - self.lower, 1.0)
-        places = np.clip((points - self.lower) / spans * (counts - 1), 0.0, counts - 1)
-        first = np.minimum(places.astype(int), np.maximum(counts - 2, 0))
-        weights, result = places - first, np.zeros(points.shape)
-        for corner in np.ndindex(2, 2, 2):
-            weight = np.prod(np.where(corner, weights, 1.0 - weights), axis=-1, keepdims=True)
-            x, y, z = np.moveaxis(np.minimum(first + corner, counts - 1), -1, 0)
-            result += weight * sum(fraction * values[x, y, z] for fraction, values in between)
+        values = self.velocities if self.times is not None else self.velocities[None]
+        counts = np.array(values.shape[:4])
+        indices = np.concatenate(
+            [np.full((*points.shape[:-1], 1), self.instant(t)), (points - self.lower) * self.cells_per_length], axis=-1
+        )
+        indices = np.clip(indices, 0.0, counts - 1)
+        first = np.minimum(indices.astype(int), np.maximum(counts - 2, 0))
+        fractions, result = indices - first, np.zeros(points.shape)
+        for corner in np.ndindex(2, 2, 2, 2):
+            weight = np.prod(np.where(corner, fractions, 1.0 - fractions), axis=-1, keepdims=True)
+            i, x, y, z = np.moveaxis(np.minimum(first + corner, counts - 1), -1, 0)
+            result += weight * values[i, x, y, z]
         return result
 
-    def _between(self, t: float) -> list[tuple[float, np.ndarray]]:
-        """Return the grids before and after t, each with its weight."""
-        place = float(np.interp(t, self.times, np.arange(len(self.times))))
-        first = int(place)
-        grids = [(1.0 - (place - first), self.velocities[first])]
-        return [*grids, (place - first, self.velocities[first + 1])] if place > first else grids
+    @property
+    def cells_per_length(self) -> Floats:
+        """Inverse distances of grid points (3,) [1/m], zero along an axis of one point."""
+        cells = np.array(self.velocities.shape[-4:-1]) - 1
+        return np.where(cells > 0, cells / np.where(cells > 0, self.upper - self.lower, 1.0), 0.0)
+
+    def instant(self, t: float) -> float:
+        """Return the index of a time among the times, with its fraction."""
+        return 0.0 if self.times is None else float(np.interp(t, self.times, np.arange(len(self.times))))
 
     def save(self, path: str | Path) -> None:
         """Write a file for `load`, HDF5 for names that end in .h5 or .hdf5, else NumPy's .npz."""
@@ -211,6 +229,7 @@ class Turbulence(Flow):
         length: integral length of the longitudinal correlation [m].
         seed: whole number from 0.
         modes: number N of modes.
+        waves, amplitudes: k_n and s sqrt(6 / N) a_n (N, 3) [1/m, m/s].
         spectrum: "von_karman" or "kraichnan".
 
     Raises:
@@ -239,20 +258,24 @@ class Turbulence(Flow):
         waves, amplitudes = _modes(draws[:3], self.spectrum)
         normal = np.sqrt(-2.0 * np.log1p(-draws[3])) * np.cos(2.0 * np.pi * draws[4])
         object.__setattr__(self, "mean", mean)
-        object.__setattr__(self, "_waves", waves / length)
-        object.__setattr__(self, "_amplitudes", deviation * np.sqrt(6.0 / count) * amplitudes)
+        object.__setattr__(self, "waves", waves / length)
+        object.__setattr__(self, "amplitudes", deviation * np.sqrt(6.0 / count) * amplitudes)
         rates = deviation / length * normal - (waves / length) @ mean
         object.__setattr__(self, "_rates", rates)
         object.__setattr__(self, "_phases", 2.0 * np.pi * draws[5])
 
     def __call__(self, points: Floats, t: float) -> Floats:
         """Return velocities at points (..., 3)."""
-        flat, phases = points.reshape(-1, 3), self._rates * t + self._phases
+        flat, phases = points.reshape(-1, 3), self.phases(t)
         result = np.empty_like(flat)
         for first in range(0, len(flat), CHUNK):
             some = slice(first, first + CHUNK)
-            result[some] = self.mean + np.cos(flat[some] @ self._waves.T + phases) @ self._amplitudes
+            result[some] = self.mean + np.cos(flat[some] @ self.waves.T + phases) @ self.amplitudes
         return result.reshape(points.shape)
+
+    def phases(self, t: float) -> Floats:
+        """Return the phases of the modes at the origin at t (N,), from 0 to 2 pi."""
+        return np.mod(self._rates * t + self._phases, 2.0 * np.pi)
 
 
 def _modes(draws: np.ndarray, spectrum: str) -> tuple[np.ndarray, np.ndarray]:

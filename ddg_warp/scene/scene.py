@@ -44,7 +44,7 @@ class Scene(Structures, RigidBodies, Fields, UserForces):
         mass_damping: mass-proportional damping alpha [1/s].
         flow: velocity of the fluid of `drag` [m/s]: uniform (3,), or a function of time that returns it. Or a field of position and
             time, such as `FlowGrid` or `Turbulence`: a function `flow(points, t)` of points (n, 3), or (worlds, n, 3), that returns
-            velocities of that shape. It is evaluated once a step, at the nodes of the start of the step.
+            velocities of that shape. It is evaluated at the nodes of the start of a step.
         initial: function of the model that returns the first state of a run; the rest state by default.
         callbacks: functions of the state, called between steps.
 

@@ -62,7 +62,7 @@ class Drag(Force):
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [self._resist]
+        return [self._resist, *self.flow.kernels]
 
     def upload(self, t0: float, t1: float) -> None:
         """Upload the flow at the evaluation time of the scheme."""
@@ -101,6 +101,7 @@ class RodGroupDrag(Drag):
     def resist(self, before, x: wp.array, mass: wp.array, rotary: wp.array, target_angle: wp.array, islands) -> None:
         """Write inertia and drag, with target angles, of a solve from the state `before`, given the predictor x."""
         group = self.part
+        self.flow.evaluate(before)
         self._launch(
             self._resist,
             group.node_threads,
@@ -168,7 +169,7 @@ class CoupledDrag(Drag):
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [kernel for kernel in (self._resist, self._resist_shells) if kernel]
+        return [kernel for kernel in (self._resist, self._resist_shells, *self.flow.kernels) if kernel]
 
     def freeze(self, before, newton) -> None:
         """Write inertia; see `Force`."""
@@ -177,6 +178,7 @@ class CoupledDrag(Drag):
     def resist(self, before, q: wp.array, mass: wp.array, load_scale: wp.array, islands) -> None:
         """Write inertia and drag `mass` of a solve from the state `before`, given the predictor q."""
         coupled = self.part
+        self.flow.evaluate(before)
         read = [before.q, before.v, q if self.midpoint else before.q, q, coupled.mass]
         further = [self.flow.array, load_scale, *islands.arrays, coupled.blocks, coupled.host.nodes]
         count = coupled.worlds * coupled.blocks
@@ -191,10 +193,10 @@ class CoupledDrag(Drag):
         """Return the forces on dof blocks with rates (world, block, 3) of a state at t [N, N m]."""
         self.upload(t, t)
         self.sample(state, t, t)
+        stiffness = self.inertia(state, 1.0).numpy()["stiffness"]
         balanced, nodes = np.zeros_like(rates), self.part.host.nodes
         flow = device_arrays.download(self.flow.array).astype(float).swapaxes(0, 1)
         balanced[:, :nodes] = self._balanced(rates, flow)[:, :nodes]
-        stiffness = self.inertia(state, 1.0).numpy()["stiffness"]
         return np.einsum("wkij,wkj->wki", stiffness, balanced - rates)
 
     def inertia(self, state, rate: float) -> wp.array:

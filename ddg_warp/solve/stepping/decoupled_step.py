@@ -19,7 +19,7 @@ from ddg_warp.kernels.collision.broad_phase.rod_culling import KNOWN
 from ddg_warp.kernels.stepping import decoupled_rods as kernels
 from ddg_warp.model.rod_elements import RodElements
 from ddg_warp.model.rod_group import RodGroup
-from ddg_warp.scene.flow import depends_on_position
+from ddg_warp.scene.flow import is_on_host
 from ddg_warp.solve.collision.rod_culling import RodCulling
 from ddg_warp.solve.stepping.rod_step import RodStep
 from ddg_warp.timers import timer
@@ -292,12 +292,7 @@ def uncoupled(model) -> bool:
 def is_decoupled(integrator) -> bool:
     """Return True if an integrator allows decoupled steps: default solver, implicit Euler, no control loads, no field of flow."""
     usual = integrator.solver == "newton" and integrator.linear == "auto" and integrator.scheme == "implicit_euler"
-    return (
-        usual
-        and not depends_on_position(integrator.model.scene.flow)
-        and integrator.given is None
-        and not integrator.whole
-    )
+    return usual and not is_on_host(integrator.model.scene.flow) and integrator.given is None and not integrator.whole
 
 
 def rods_of(model) -> list[RodGroup]:

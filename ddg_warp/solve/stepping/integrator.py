@@ -16,7 +16,7 @@ from ddg_warp.model import validate
 from ddg_warp.model.controls import DRIVES, Controls, TimedControls, checked, controls_at
 from ddg_warp.model.model import Model, check_model
 from ddg_warp.model.state import State, check_state
-from ddg_warp.scene.flow import depends_on_position
+from ddg_warp.scene.flow import is_on_host
 from ddg_warp.solve.forces.control_loads import LOADS, Given
 from ddg_warp.solve.forces.gyroscopic import Gyroscope
 from ddg_warp.solve.forces.prescribed_motion import counts_revolutions, rotations_between
@@ -267,7 +267,7 @@ class Integrator:
         self.model.drives.to(self.evaluation_time(start, dt), 1.0, self.given_drives)
         for part in self._parts:
             part.prescribe(start, start + dt)
-        if depends_on_position(self.model.scene.flow):
+        if is_on_host(self.model.scene.flow):
             before = self._buffers[source].own
             for rod_step in self._rod_steps:
                 rod_step.sample(before.groups[rod_step.index], start, start + dt)
