@@ -244,3 +244,43 @@ def test_gust_on_turbulence():
     turbulence, points = ddg.Turbulence((8.0, 0.0, 0.0), 0.1, 2.0), np.zeros((4, 3))
     flow = turbulence + gust + (0.0, 1.0, 0.0)
     np.testing.assert_allclose(flow(points, 4.0), turbulence(points, 4.0) + [6.0, 1.0, 0.0])
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_wrench_of_a_fixed_plate(device, scheme):
+    """The support of a plate that is fixed everywhere takes the drag of a step, in every world and precision."""
+    for precision in ("float64", "mixed"):
+        scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), flow=(5.0, 1.0, 2.0))
+        points, triangles = meshes.rectangle(3, 2, (0.6, 0.4), "alternating")
+        shell = scene.add_shell(points, triangles, thickness=1e-3, material=CLOTH, bending="hinge")
+        scene.hold(shell, np.arange(len(points)), name="frame")
+        scene.drag(**LAWS["quadratic"])
+        model = scene.build(device, precision, worlds=2)
+        integrator, state = ddg.Integrator(model, scheme), model.state()
+        integrator.watch_wrenches()
+        state = integrator.step(state, 0.01)
+        expected = plate_force("quadratic", 0.5 * np.pi, np.array([5.0, 1.0, 2.0]))
+        for world in range(2):
+            np.testing.assert_allclose(model.drag(state).force[world].sum(0), expected, rtol=1e-6)
+            np.testing.assert_allclose(integrator.wrenches()["frame"].force[world], -expected, rtol=1e-6)
+
+
+def test_missing_gradients_are_refused():
+    """Names: a function of position of a user, wrenches with drag of shells, and the radius of rods in a quadratic law."""
+    from ddg_warp.adjoint.implicit import Adjoint
+
+    model = plate("cpu", flow=lambda points, t: points)
+    with pytest.raises(ddg.SceneError, match="flow is a function of position that has no gradient"):
+        Adjoint(ddg.Integrator(model))
+    pytest.importorskip("torch")
+    from ddg_warp.torch import RodParameters, Simulator
+
+    simulator = Simulator(plate("cpu"), 0.01)
+    state = simulator.initial_state()
+    with pytest.raises(ddg.SceneError, match="wrenches with drag of shells"):
+        simulator.wrenches(state, simulator.step(state))
+    scene = ddg.Scene()
+    scene.add_rod(np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 5), section=ddg.Circle(0.01), material=CLOTH)
+    scene.drag(law=ddg.QuadraticDrag(RHO))
+    with pytest.raises(ddg.SceneError, match="'radius' does not change the QuadraticDrag of rod 0"):
+        RodParameters(Simulator(scene.build("cpu"), 0.01), names=("radius",))

@@ -180,13 +180,13 @@ class CoupledStepAdjoint:
             rate=make(real),
             damping=make(real),
             gravity=make(),
-            coefficients={force.force.name: force.by_coefficients for force in self.forces if force.quadratic},
+            coefficients=self._quadratic.by_names if self._quadratic else {},
             elements_rate=[
                 wp.zeros(part.elements * coupled.worlds, dtype=real, device=self.device) for part in coupled.sets
             ],
         )
         if self._quadratic:
-            self._inputs.elements_rate.append(self._quadratic.by_rate)
+            self._inputs.elements_rate += self._quadratic.rates
         if self.user_forces:
             self._inputs.user_forces = self.user_forces.by_parameters
             self._inputs.elements_rate.append(self.user_forces.by_rate)

@@ -7,7 +7,7 @@ import warp as wp
 from scipy import sparse
 
 from ddg_warp import device_arrays
-from ddg_warp.kernels.adjoint import drag, follower_loads
+from ddg_warp.kernels.adjoint import drag, follower_loads, shell_drag
 from ddg_warp.kernels.core.inertia import block_inertia
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.forces.drag import ROWS
@@ -113,22 +113,39 @@ class DragAdjoint:
     Attributes:
         by_coefficients: gradient by the coefficients of edges (rows of `kernels.forces.drag`, n, R), written by `vjp`; of the coupled
             system (rows, W E), added to.
+        by_names: gradients by coefficients, by name of the coefficients.
+        rates: gradients by the rate in contributions of elements, added to.
     """
 
     quadratic = True
+    rates: tuple = ()
 
     def __init__(self, model, part, force, nodes, closed: bool, edges: int):
         self.part, self.force, real = part, force, model.types.real
-        self._edges, self._gather = drag.pull_kernels(nodes, closed, real, force.midpoint, is_square(model.scene))
+        self._laws = force.midpoint, is_square(model.scene), force.flow.is_field
+        self._edges, self._gather = drag.pull_kernels(nodes, closed, real, *self._laws)
+        self._field_kernels = force.flow.pull_kernels(nodes, real)
+        self._by_flow = wp.zeros_like(force.flow.array) if force.flow.is_field else None
         self._shape, vector = (edges, part.columns), wp.types.vector(part.dim, real)
         self._by_edge, self._by_velocity, self._by_nodes = (
             device_arrays.allocate((*rows, *self._shape), vector, model.wp_device) for rows in ((), (2,), (2,))
         )
 
     @property
+    def by_names(self) -> dict[str, wp.array]:
+        """See the class."""
+        return {self.force.name: self.by_coefficients}
+
+    @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [self._edges, self._gather, *self.force.kernels]
+        return [self._edges, self._gather, *self._field_kernels, *self.force.kernels]
+
+    def _pull_field(self, before, by_rate, start) -> None:
+        """Add the gradients by the nodes before through a field of flow, and clear `_by_flow`."""
+        if self.force.flow.is_field:
+            self.force.flow.pull(self._field_kernels, before, self._by_flow, by_rate, start)
+            self._by_flow.zero_()
 
     def _pull(self, lists: tuple, read: list, by_coefficients, by_rate, by_tangents, by_fixed, start) -> None:
         """Launch the kernels; `lists` and arrays as of `kernels.adjoint.drag.pull_kernels`."""
@@ -140,8 +157,11 @@ class DragAdjoint:
         device = self.force.model.wp_device
         inputs = [ends, angles, part.count, *read]
         wp.launch(self._edges, self._shape, inputs, [*slots, by_coefficients, by_rate, start], device=device)
-        outputs = [by_tangents, by_fixed, start]
-        wp.launch(self._gather, start.x.shape, [starts, items, part.count, fixed, *slots], outputs, device=device)
+        inputs, outputs = (
+            [starts, items, part.count, fixed, *slots, read[-1]],
+            [by_tangents, by_fixed, self._by_flow, start],
+        )
+        wp.launch(self._gather, start.x.shape, inputs, outputs, device=device)
 
 
 class RodDragAdjoint(DragAdjoint):
@@ -155,6 +175,7 @@ class RodDragAdjoint(DragAdjoint):
     def vjp(self, pull: ForceCotangents) -> None:
         """Add the gradients of drag."""
         group, before, solved = self.part, pull.before, pull.solved
+        self.force.flow.evaluate(before)
         tangents = pull.predicted if self.force.midpoint else before.x
         read = [
             tangents,
@@ -166,13 +187,14 @@ class RodDragAdjoint(DragAdjoint):
         ]
         outputs = [self.by_coefficients, pull.by_rate, pull.by_predicted, pull.by_fixed, group.node_state(pull.start)]
         self._pull((None, None, None, None, group.fixed), [*read, pull.w, pull.rate], *outputs)
+        self._pull_field(group.node_state(before), pull.by_rate, group.node_state(pull.start))
 
 
 class CoupledDragAdjoint(DragAdjoint):
     """VJP of drag on the coupled system.
 
     Attributes:
-        by_rate: gradient by the rate (W E,), added to.
+        by_shell_coefficients: gradient by the coefficients of triangles (2, W T), added to.
         inertia: inertia and drag of the dof blocks in the current solve (worlds, N), written by `resist`.
     """
 
@@ -182,11 +204,32 @@ class CoupledDragAdjoint(DragAdjoint):
         values = ends.T, angles, *lists(ends.ravel(), coupled.blocks)
         self._lists = [wp.array(np.ascontiguousarray(v, np.int32), dtype=int, device=device) for v in values]
         count = coupled.worlds * len(angles)
-        self.by_coefficients, self.by_rate = (
-            wp.zeros(shape, dtype=real, device=device) for shape in ((ROWS, count), count)
-        )
+        self.by_coefficients, by_rate = (wp.zeros(shape, dtype=real, device=device) for shape in ((ROWS, count), count))
+        by_rate_of_nodes = wp.zeros(coupled.worlds * coupled.blocks, dtype=real, device=device)
+        self.rates = by_rate_of_nodes, by_rate
+        self._triangles = coupled.host.drag_triangles
+        if len(self._triangles):
+            self._shell_kernels = shell_drag.pull_kernels(coupled.nodes, real, *self._laws)
+            values = self._triangles, *lists(self._triangles.ravel(), coupled.blocks)
+            self._shell_lists = [wp.array(np.ascontiguousarray(v, np.int32), dtype=int, device=device) for v in values]
+            shape = len(self._triangles), coupled.worlds
+            self._by_corners = [wp.zeros((3, *shape), dtype=coupled.vector, device=device) for _ in range(3)]
+            count = shape[0] * shape[1]
+            self.by_shell_coefficients = wp.zeros((2, count), dtype=real, device=device)
+            self.rates += (wp.zeros(count, dtype=real, device=device),)
         self.inertia = wp.zeros((coupled.worlds, coupled.blocks), dtype=block_inertia(real), device=device)
         self._islands = Islands(coupled.worlds, real, device)
+
+    @property
+    def by_names(self) -> dict[str, wp.array]:
+        """See `DragAdjoint`."""
+        of_shells = {"shell_drag": self.by_shell_coefficients} if len(self._triangles) else {}
+        return (super().by_names if self.force.coefficients is not None else {}) | of_shells
+
+    @property
+    def kernels(self) -> list:
+        """Kernels to load before a capture."""
+        return [*super().kernels, *(self._shell_kernels if len(self._triangles) else ())]
 
     def resist(self, before, tangents: wp.array, rate: float) -> None:
         """Write `inertia` of a solve from the state `before`, with the tangents of that solve."""
@@ -204,16 +247,27 @@ class CoupledDragAdjoint(DragAdjoint):
         points, components = coupled.points, coupled.components
 
         def by_world(values: wp.array) -> wp.array:
-            """View values of edges (W E,) as [edge][world]."""
+            """View values of elements (W E,) as [element][world]."""
             return values.reshape((worlds, -1)).transpose((1, 0))
 
         def rows(values: wp.array) -> wp.array:
-            """View coefficients (rows, W E) as [row][edge][world]."""
-            return values.reshape((ROWS, worlds, -1)).transpose((0, 2, 1))
+            """View coefficients (rows, W E) as [row][element][world]."""
+            return values.reshape((values.shape[0], worlds, -1)).transpose((0, 2, 1))
 
         tangents = points(pull.predicted if self.force.midpoint else before.q)
-        read = [tangents, coupled.node_state(before), points(pull.solved.q), None, rows(self.force.coefficients)]
-        read += [self.force.flow.array, components(pull.w), pull.rate]
         by_tangents = components(pull.by_predicted) if self.force.midpoint else None
-        outputs = [rows(self.by_coefficients), by_world(self.by_rate), by_tangents, components(pull.by_fixed)]
-        self._pull((*self._lists, None), read, *outputs, coupled.node_state(pull.start))
+        by_fixed, start = components(pull.by_fixed), coupled.node_state(pull.start)
+        state, x, w = coupled.node_state(before), points(pull.solved.q), components(pull.w)
+        flow = self.force.flow.array
+        if self.force.coefficients is not None:
+            read = [tangents, state, x, None, rows(self.force.coefficients), flow, w, pull.rate]
+            outputs = [rows(self.by_coefficients), by_world(self.rates[1]), by_tangents, by_fixed, start]
+            self._pull((*self._lists, None), read, *outputs)
+        if len(self._triangles):
+            (corners, *items), (triangles, gather) = self._shell_lists, self._shell_kernels
+            read = [corners, tangents, state, x, rows(self.force.shell_coefficients), flow, w, pull.rate]
+            outputs = [*self._by_corners, rows(self.by_shell_coefficients), by_world(self.rates[2])]
+            wp.launch(triangles, self._by_corners[0].shape[1:], read, outputs, device=coupled.device)
+            inputs, outputs = [*items, *self._by_corners, pull.rate], [by_tangents, by_fixed, self._by_flow, start]
+            wp.launch(gather, start.x.shape, inputs, outputs, device=coupled.device)
+        self._pull_field(state, by_world(self.rates[0]), start)

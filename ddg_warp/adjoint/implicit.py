@@ -23,7 +23,7 @@ from ddg_warp.model.controls import Controls, checked
 from ddg_warp.model.coupled_model import CoupledState
 from ddg_warp.model.rigid_bodies import refuse_rigid_bodies
 from ddg_warp.model.state import State, check_state
-from ddg_warp.scene.flow import depends_on_position
+from ddg_warp.scene.flow import is_on_host
 
 
 @dataclass
@@ -58,7 +58,7 @@ class Adjoint:
     def __init__(self, integrator):
         refuse_rigid_bodies("gradients", integrator.model)
         self.integrator, self.model = integrator, integrator.model
-        refuse_wind("gradients", integrator.model.scene)
+        refuse_flow("gradients", integrator.model.scene)
         refuse_gyroscopic("Adjoint", integrator.gyroscopic)
         integrator.step_whole()
         self.rod_adjoints = [RodStepAdjoint(self.model, group, integrator.scheme) for group in self.model.groups]
@@ -150,19 +150,16 @@ class Adjoint:
         return State(self.model, groups, coupled, before.time, self._grips), inputs
 
 
-def refuse_wind(call: str, scene) -> None:
-    """Refuse drag without gradients: of shells, or in a flow that depends on position.
+def refuse_flow(call: str, scene) -> None:
+    """Refuse a flow that is a function of position of a user, through which there is no gradient.
 
     Raises:
-        SceneError: names the shell, or the flow.
+        SceneError: names the flow.
     """
-    if scene.shell_drags:
-        shell = scene.shell_drags[0].shell
+    if is_on_host(scene.flow):
         raise SceneError(
-            f"{call}: drag of shell {shell} ('{scene.shells[shell].name}') has no gradient; only drag of rods has one"
+            f"{call}: flow is a function of position that has no gradient; give a FlowGrid, a Turbulence or a uniform flow"
         )
-    if depends_on_position(scene.flow):
-        raise SceneError(f"{call}: flow depends on position, and has no gradient; give a uniform flow")
 
 
 def refuse_gyroscopic(caller: str, wanted: bool | None) -> None:

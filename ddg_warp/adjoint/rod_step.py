@@ -155,7 +155,7 @@ class RodStepAdjoint:
             rate=self._make(),
             damping=self._make(),
             gravity=self._make(self.vector),
-            coefficients={force.force.name: force.by_coefficients for force in self.forces if force.quadratic},
+            coefficients=self._quadratic.by_names if self._quadratic else {},
         )
 
     def suit(self, step, s: float) -> bool:

@@ -250,8 +250,9 @@ class Case:
         moved = [motion for motion in self.model.motions if not isinstance(motion, Grip)]
         parts = [*self.model.groups, *([self.model.coupled] if self.model.coupled is not None else [])]
         loads = any(part.host.timed for part in parts)
-        if moved or loads or (field is not None and (callable(field.value) or callable(field.gradient))):
-            return "the reverse does not differentiate motions, loads and fields that are functions of time"
+        timed = field is not None and (callable(field.value) or callable(field.gradient))
+        if moved or loads or timed or callable(self.model.scene.flow):
+            return "the reverse does not differentiate motions, loads, flows and fields that are functions of time"
         return ""
 
     def _by_step(self, x: float) -> WorldState:

@@ -6,6 +6,7 @@ import numpy as np
 
 from ddg_warp.geometry import meshes
 from ddg_warp.scene.drag import Granular, QuadraticDrag
+from ddg_warp.scene.flow import Turbulence
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.material import Circle, Ellipse, Material, Ribbon
 from ddg_warp.scene.obstacles import Plane, Sphere
@@ -111,6 +112,9 @@ def _magnetised(magnetisation, field, dipoles: bool = False) -> Callable:
     return magnetise
 
 
+EDDIES = Turbulence((0.5, 0.2, 1.0), 0.5, 0.2, modes=16)
+
+
 def _drag(scene: Scene, rods) -> None:
     scene.drag(rods, tangential=0.1, normal=0.2, rotational=1e-6, nodes=0.01)
 
@@ -119,8 +123,8 @@ def _sand(scene: Scene, rods) -> None:
     scene.drag(rods, Granular(lateral=0.3, friction=0.1, leading=0.05, speed=0.05))
 
 
-def _wind(scene: Scene, rods) -> None:
-    scene.flow = 0.5, 0.2, 1.0
+def _wind(scene: Scene, rods, flow=(0.5, 0.2, 1.0)) -> None:
+    scene.flow = flow
     scene.drag(rods, QuadraticDrag(300.0, tangential=0.1))
 
 
@@ -219,6 +223,8 @@ OBJECTS: dict[str, tuple[int, Callable]] = {
     "rod in sand": (3, _rod(more=_sand)),
     "rod in wind": (3, _rod(section=Circle(0.004), more=_wind)),
     "joined rods in wind": (3, _joined(more=_wind)),
+    "shell in turbulence": (3, _sheet("midedge_dof", more=lambda scene, shell: _wind(scene, None, EDDIES))),
+    "shell in wind": (3, _sheet("midedge_dof", more=lambda scene, shell: _wind(scene, None))),
     "joined rods with drag": (3, _joined(more=_some_drag)),
     "rod in a motion": (3, _rod(hold=lambda s, r: s.clamp(r, motion=SWING))),
     "gripped rod": (3, _rod(hold=lambda s, r: s.clamp(r, motion=Grip(pivot=(0.1, 0.0, 0.0))))),

@@ -4,13 +4,16 @@
     "rod.inertia"    [kg m^2] about the tangent, of the edges of rods with twist
     "shell.mass"     [kg] of the vertices of all shells, "meridian.mass" of the nodes of all shells of revolution
     "FORCE.NAME"     of the edges of rods with a force of `solve.forces.force_list.WITH_PARAMETERS`, whose class describes them
+    "shell_drag.normal", "shell_drag.tangential"
+                     of the triangles of shells with drag [N s/m^3], in scenes with quadratic drag [kg/m^3]
     "contact.stiffness" [N/m], "contact.range" [m], no larger than the largest of the scene, "contact.friction"
                      between objects of two names, or of one, that may come into contact. Friction exists in scenes with friction;
                      if anisotropic it is the smallest nonzero coefficient, to which the others keep their ratios
     "contact.radius" [m] of rods and obstacles that have one, half thicknesses of shells and meshes
 
 `contact_parameters.contact_elements` lists the owners of contact parameters in order. Points and edges are in the order of
-`State.points` and `State.angles`. The mass of several points that are one node of the coupled system is the sum.
+`State.points` and `State.angles`, triangles shell by shell. The mass of several points that are one node of the coupled system is
+the sum.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,6 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ddg_warp.kernels.forces.shell_drag import NORMAL, TANGENTIAL
 from ddg_warp.model.masses import point_masses
 from ddg_warp.solve.forces.force_list import WITH_PARAMETERS
 from ddg_warp.torch import contact_parameters
@@ -26,7 +30,8 @@ from ddg_warp.torch.state_layout import view
 
 MASSES = ("rod.mass", "shell.mass", "meridian.mass")
 COEFFICIENTS = {f"{force.name}.{name}": (force, name) for force in WITH_PARAMETERS for name in force.parameters}
-NAMES = (*MASSES, "rod.inertia", *COEFFICIENTS, *contact_parameters.NAMES)
+SHELL_COEFFICIENTS = {"shell_drag.normal": NORMAL, "shell_drag.tangential": TANGENTIAL}
+NAMES = (*MASSES, "rod.inertia", *COEFFICIENTS, *SHELL_COEFFICIENTS, *contact_parameters.NAMES)
 SIGNED = [f"{force.name}.{name}" for force in WITH_PARAMETERS for name in force.signed]
 POSITIVE = [
     *(f"{force.name}.{name}" for force in WITH_PARAMETERS for name in force.positive),
@@ -51,7 +56,7 @@ class _Part:
 
 
 def elements(model, name: str) -> np.ndarray:
-    """Return the rows of `State.points`, or of `State.angles`, that have a parameter, in ascending order (E,)."""
+    """Return the rows of `State.points`, of `State.angles` or of all triangles that have a parameter, in ascending order (E,)."""
     return np.unique(np.concatenate([np.zeros(0, int), *(part.rows for part in _parts(model, name))]))
 
 
@@ -105,6 +110,8 @@ def rule(name: str, usual: np.ndarray) -> tuple[str, Callable]:
 def _parts(model, name: str) -> Iterator[_Part]:
     if name in MASSES:
         return _masses(model, name)
+    if name in SHELL_COEFFICIENTS:
+        return _shell_coefficients(model, name)
     return _inertia(model) if name == "rod.inertia" else _coefficients(model, name)
 
 
@@ -225,3 +232,23 @@ def _coefficients(model, name: str) -> Iterator[_Part]:
             lambda: view(coupled.coefficients[of_force])[row].view(shape),
             lambda inputs: None if (values := found(inputs)) is None else values.view(shape[:2]),
         )
+
+
+def _shell_coefficients(model, name: str) -> Iterator[_Part]:
+    coupled, row, drags = model.coupled, SHELL_COEFFICIENTS[name], model.scene.shell_drags
+    if not drags:
+        return
+    counts = [len(shell.triangles) for shell in model.scene.shells]
+    rows = np.concatenate([sum(counts[: drag.shell]) + np.arange(counts[drag.shell]) for drag in drags])
+    usual, shape = coupled.host.shell_coefficients[row], (coupled.worlds, len(rows), 1)
+    yield _Part(
+        -1,
+        False,
+        name,
+        usual,
+        np.arange(len(rows)),
+        rows,
+        usual,
+        lambda: view(coupled.shell_coefficients)[row].view(shape),
+        lambda inputs: view(inputs.coefficients["shell_drag"])[row].view(shape[:2]),
+    )

@@ -7,7 +7,7 @@ import torch
 import warp as wp
 
 from ddg_warp.errors import SceneError
-from ddg_warp.scene import edge_forces
+from ddg_warp.scene import drag, edge_forces
 from ddg_warp.torch import contact_parameters, named_parameters
 from ddg_warp.torch.positive_parameters import parameter_key, requested, usual_values
 from ddg_warp.torch.simulator import Simulator
@@ -129,6 +129,12 @@ def _weight(model, name: str) -> np.ndarray:
 
 def _require_sizes(scene) -> None:
     """Refuse rods with stiffnesses or magnetic moments that a radius does not determine."""
+    for each in scene.drags:
+        if isinstance(each.law, drag.QuadraticDrag) and each.law.radius is None:
+            raise SceneError(
+                f"RodParameters: 'radius' does not change the QuadraticDrag of rod {each.rods[0]}; give it a radius, or learn "
+                "'stretching', 'bending', 'twisting' and 'density'"
+            )
     magnetised = {rod for magnet in scene.magnets for rod in np.ravel(magnet.rods).tolist()}
     for batch in scene.batches:
         if not batch.sized:

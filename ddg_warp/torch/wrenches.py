@@ -152,6 +152,7 @@ def without_gradient(engine) -> str:
             for part, places in zip(parts, fixed, strict=True)
             for load in part.host.followers
         ),
+        "drag of shells": bool(model.scene.shell_drags),
     }
     return next((name for name, used in refused.items() if used), "")
 

@@ -38,12 +38,13 @@ def work_function(dim: int, real, square: bool):
 
 
 @cache
-def pull_kernels(nodes: NodeStorage, closed: bool, real, midpoint: bool, square: bool):
-    """Build the kernels of the product; `square`: quadratic drag.
+def pull_kernels(nodes: NodeStorage, closed: bool, real, midpoint: bool, square: bool, field: bool):
+    """Build the kernels of the product, of quadratic drag if `square`, in a flow that depends on position if `field`.
 
     `edges`: write gradients by edge vectors of `tangents`, by velocities of edges before and of nodes in the solve, by coefficients.
     Add gradients by the rate and by twist angles; of the coupled system by coefficients, too.
-    `gather`: add gradients by nodes; by tangents to `tangent_out` if these are predicted, else to the previous positions.
+    `gather`: add gradients by nodes; by tangents to `tangent_out` if these are predicted, else to the previous positions. With a
+    field, add gradients by the velocity of the fluid at nodes.
 
     The coupled system has the nodes `ends` of every edge, and the dof block of its angle or -1. The items of a node are edges that
     begin there, and edges that end there plus the number of edges.
@@ -159,8 +160,10 @@ def pull_kernels(nodes: NodeStorage, closed: bool, real, midpoint: bool, square:
         edge_in: wp.array2d(dtype=V),
         velocity_in: wp.array3d(dtype=V),
         node_in: wp.array3d(dtype=V),
+        rate: wp.array(dtype=real),
         tangent_out: wp.array3d(dtype=real),
         fixed_out: wp.array3d(dtype=real),
+        flow_out: wp.array2d(dtype=V),
         start_out: State,
     ):
         k, island = wp.tid()
@@ -192,6 +195,8 @@ def pull_kernels(nodes: NodeStorage, closed: bool, real, midpoint: bool, square:
                 by_tangent, by_velocity, by_node = add(
                     edge_in, velocity_in, node_in, 1, b, island, by_tangent, by_velocity, by_node
                 )
+        if wp.static(field):
+            flow_out[k, island] = flow_out[k, island] - by_velocity - by_node / rate[island]
         for d in range(wp.static(dim)):
             if ((mask >> d) & 1) == 1:
                 fixed_out[d, k, island] = fixed_out[d, k, island] + by_node[d]

@@ -71,27 +71,26 @@ def mode_functions(real):
 
 @cache
 def grid_functions(real):
-    """Return the device function `velocity(x, velocities, box, instant)`.
+    """Return the device functions `cell(index, count)`, and `velocity(x, velocities, box, instant)`.
 
-    Velocities are [time][x][y][z], `box` the lower corner and the inverse distances of grid points (2,), `instant` the index of the
-    time with its fraction.
+    `cell` returns the cell of an index with a fraction, and the fraction. Velocities are [time][x][y][z]. `box` has the lower corner
+    and the inverse distances of grid points (2,); `instant` is the index of the time with its fraction.
     """
     X = wp.types.vector(3, real)
 
     @wp.func
-    def along(x: real, count: int):
-        """Return the cell of an index with a fraction, and the fraction."""
-        inside = wp.clamp(x, real(0.0), real(count - 1))
-        cell = wp.min(int(inside), wp.max(count - 2, 0))
-        return cell, inside - real(cell)
+    def cell(index: real, count: int):
+        inside = wp.clamp(index, real(0.0), real(count - 1))
+        first = wp.min(int(inside), wp.max(count - 2, 0))
+        return first, inside - real(first)
 
     @wp.func
     def velocity(x: X, velocities: wp.array4d(dtype=X), box: wp.array(dtype=X), instant: real):
         index = wp.cw_mul(x - box[0], box[1])
-        i, a = along(index[0], velocities.shape[1])
-        j, b = along(index[1], velocities.shape[2])
-        k, c = along(index[2], velocities.shape[3])
-        t, d = along(instant, velocities.shape[0])
+        i, a = cell(index[0], velocities.shape[1])
+        j, b = cell(index[1], velocities.shape[2])
+        k, c = cell(index[2], velocities.shape[3])
+        t, d = cell(instant, velocities.shape[0])
         result = X()
         for corner in range(16):
             di = corner & 1
@@ -104,7 +103,7 @@ def grid_functions(real):
                 result += velocities[t + dt, i + di, j + dj, k + dk] * weight
         return result
 
-    return velocity
+    return cell, velocity
 
 
 @cache
@@ -133,7 +132,7 @@ def mode_kernel(dim: int, real):
 def grid_kernel(dim: int, real):
     """Build the kernel `add`: add the velocity on a grid at nodes."""
     V, X = wp.types.vector(dim, real), wp.types.vector(3, real)
-    velocity, (lift, drop) = grid_functions(real), space_functions(dim, real)
+    (_, velocity), (lift, drop) = grid_functions(real), space_functions(dim, real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def add(

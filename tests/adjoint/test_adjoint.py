@@ -253,15 +253,18 @@ def test_the_midpoint_rule_with_predictors_that_rotate_edges(name, monkeypatch):
 FLUID = {"tangential": 0.7, "normal": 1.9, "rotational": 3e-5, "nodes": 0.05}
 WIND = ddg.QuadraticDrag(2e4, tangential=0.2)
 SAND = ddg.Granular(lateral=0.3, friction=0.2, leading=0.1, speed=0.05)
+GRID = np.random.default_rng(5).uniform(-0.2, 0.2, (2, 3, 1, 3, 3)) * [1.0, 0.0, 1.0]
+SHEAR = ddg.FlowGrid(GRID, (-0.3, 0.0, -0.3), (0.7, 0.0, 0.6), times=(0.0, 0.1))
+EDDIES = ddg.Turbulence((0.1, 0.0, 0.2), 0.8, 0.2, seed=1, modes=32) + ddg.Gust((0.1, 0.2, 0.0), duration=0.1)
 
 
-def resisted(name: str, density: float = 1000.0, **law):
+def resisted(name: str, density: float = 1000.0, flow=(0.1, 0.0, 0.2), **law):
     """Rods in a fluid that flows, or in sand; without inertia where they have no density."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(f"{__name__}.SOFT", ddg.Material(young=1e6, density=density, viscosity=0.01))
         scene = SCENES[name]()
     scene.drag(**law)
-    scene.flow = (0.1, 0.0, 0.2)
+    scene.flow = flow
     return scene
 
 
@@ -287,6 +290,12 @@ LAGGED = {
     "sand, joined": lambda: resisted("joined", law=SAND),
     "wind, twisted": lambda: resisted("twisted", law=WIND),
     "wind, joined": lambda: resisted("joined", law=WIND),
+    "fluid, sheet": lambda: resisted("sheet", normal=9.0, tangential=3.0),
+    "wind, sheet": lambda: resisted("sheet", law=WIND),
+    "wind, stiffened": lambda: resisted("stiffened", law=WIND),
+    "turbulence, twisted": lambda: resisted("twisted", flow=EDDIES, law=WIND),
+    "turbulence, planar": lambda: resisted("planar", flow=SHEAR, **FLUID),
+    "turbulence, stiffened": lambda: resisted("stiffened", flow=EDDIES, law=WIND),
     "no inertia, twisted": lambda: resisted("twisted", 0.0, **FLUID),
     "no inertia, joined": lambda: resisted("joined", 0.0, **FLUID),
     "couple, twisted": lambda: coupled("twisted"),

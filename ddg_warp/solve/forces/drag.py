@@ -55,8 +55,8 @@ class Drag(Force):
     @staticmethod
     def has(name: str, coefficients: np.ndarray, twisted) -> np.ndarray:
         """Return the mask of edges that have a parameter (E,) from coefficients (rows, E), and the mask of edges with twist."""
-        granular = coefficients[drag.SPEED] > 0.0
-        chosen = (granular == (name in GRANULAR)) | (name in BODIES)
+        speed = coefficients[drag.SPEED]
+        chosen = speed >= 0.0 if name in BODIES else (speed > 0.0) == (name in GRANULAR)
         return chosen & twisted if name == "rotational" else chosen
 
     @property

@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp import device_arrays
+from ddg_warp.kernels.adjoint import flow as adjoint_kernels
 from ddg_warp.kernels.forces import flow as kernels
 from ddg_warp.scene.flow import FlowGrid, Turbulence, depends_on_position, flow_at, is_on_host, terms_of
 
@@ -68,6 +69,24 @@ class FlowVelocity:
             inputs = [x, v, self._count, self._lead, *field.arrays]
             wp.launch(add, self.array.shape, inputs, [self.array], device=x.device)
 
+    @property
+    def is_field(self) -> bool:
+        """True if the flow depends on position, and is evaluated on the device."""
+        return bool(self._fields)
+
+    def pull_kernels(self, nodes, real) -> list:
+        """Return the kernels of `pull` for nodes of a `NodeStorage`."""
+        return [field.pull_kernel(nodes, real) for field in self._fields]
+
+    def pull(self, kernels, before, by_flow: wp.array, by_rate: wp.array, start) -> None:
+        """Add the gradients by the nodes before and by the rate, given the gradient by velocities of the fluid.
+
+        States are of nodes; arrays are [node][column].
+        """
+        for field, kernel in zip(self._fields, kernels, strict=True):
+            inputs = [before, self._count, self._lead, *field.arrays, by_flow]
+            wp.launch(kernel, self.array.shape, inputs, [by_rate, start], device=by_flow.device)
+
     def sample(self, state, t0: float, t1: float) -> None:
         """Upload a function of a user at the nodes of a state, for a step between t0 and t1."""
         if not self._on_host:
@@ -108,10 +127,10 @@ class _Modes:
     """Modes of a `Turbulence` on a device, its mean in the first, of wave number zero.
 
     Attributes:
-        kernel: factory of its kernel; arrays: inputs of the kernel.
+        kernel, pull_kernel: factories of its kernels; arrays: inputs of the kernels.
     """
 
-    kernel = staticmethod(kernels.mode_kernel)
+    kernel, pull_kernel = staticmethod(kernels.mode_kernel), staticmethod(adjoint_kernels.mode_kernel)
 
     def __init__(self, flow: Turbulence, real, device):
         self._flow = flow
@@ -128,7 +147,7 @@ class _Modes:
 class _Grid:
     """Velocities of a `FlowGrid` on a device; see `_Modes`."""
 
-    kernel = staticmethod(kernels.grid_kernel)
+    kernel, pull_kernel = staticmethod(kernels.grid_kernel), staticmethod(adjoint_kernels.grid_kernel)
 
     def __init__(self, flow: FlowGrid, real, device):
         self._flow, vector = flow, wp.types.vector(3, real)
