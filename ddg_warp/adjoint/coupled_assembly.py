@@ -116,6 +116,32 @@ class CoupledAssembly:
             self._launch(self.gather, len(grad_q), [starts, items, count, coupled.blocks, self._ends], [grad_q])
         self.add_own(by_own)
 
+    def unturn(
+        self,
+        start: CoupledState,
+        before: CoupledState,
+        q: wp.array,
+        own_rows: list[wp.array],
+        grad_q: wp.array,
+        frame: wp.array,
+        by_data: list[wp.array],
+    ) -> None:
+        """Reverse `CoupledModel.turn_ghosts`: from own lagged rows of `start` to those of `before`, overwritten in `own_rows`.
+
+        Gradients by the rotation vectors in the blocks q, by frames and by constant data are accumulated.
+        """
+        coupled = self.coupled
+        self.clear()
+        for i, part in enumerate(coupled.sets):
+            if part.term.measure.spins:
+                elements = coupled.elements(start, i, q)
+                elements.lag = before.lag[i]
+                count = part.elements * coupled.worlds
+                self._launch(self._lags[i], count, [elements, own_rows[i]], [self.slots[i], self.lags[i]])
+                own_rows[i].zero_()
+        self.collect(grad_q, frame, by_data)
+        self.add_own(own_rows)
+
     def _list(self, targets: np.ndarray, count: int) -> tuple[wp.array, wp.array, int]:
         """Return the incidence list (starts, items) of `count` targets, and the number of elements."""
         starts, items = lists(targets.ravel(), count)

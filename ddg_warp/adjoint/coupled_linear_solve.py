@@ -72,16 +72,18 @@ class CoupledLinearSolve:
                 without.
 
         Raises:
-            SolverError: H is singular (host only; see `failed`), or the host is to solve a step in contact, which it cannot.
+            SolverError: H is singular (host only; see `failed`), or the host is to solve a step in contact or with rigid bodies,
+                which it cannot.
         """
         coefficient = rate * (rate + self.model.scene.mass_damping)
         if self.system and not factors:
             self._rate.fill_(rate)
             self.system.solve(state, coefficient, self._rate, rhs, w)
             return
-        if self.system and self.system.contact:
+        if self.system and (self.system.contact or self.system.rigid_bodies):
+            what = "contact" if self.system.contact else "rigid bodies"
             raise SolverError(
-                "contact: conjugate gradients have not solved the reverse of the step: no gradient goes through it; take a smaller dt",
+                f"{what}: conjugate gradients have not solved the reverse of the step: no gradient goes through it; take a smaller dt",
                 outcome="no_gradient",
             )
         tangent, host = self.tangent, self._host

@@ -15,6 +15,7 @@ from ddg_warp.adjoint.coupled_assembly import CoupledAssembly
 from ddg_warp.adjoint.coupled_linear_solve import CoupledLinearSolve
 from ddg_warp.adjoint.coupled_predictor import CoupledPredictor
 from ddg_warp.adjoint.forces import ForceCotangents, force_adjoints, quadratic_of
+from ddg_warp.adjoint.rigid_bodies import CORRECTIONS, RigidBodyAdjoint, refuse
 from ddg_warp.adjoint.supports import Supports
 from ddg_warp.adjoint.user_force import UserForceAdjoint
 from ddg_warp.kernels.adjoint import coupled_step, elements, time_step
@@ -28,7 +29,8 @@ class CoupledSavedStep:
 
     `lagged` are the solutions at the friction lags (W N,), in this order; all other lagged data stay. For an equilibrium with
     friction, `before` is the state that slips are measured from, and `friction_rate` is the inverse increment of the load parameter
-    since then.
+    since then. `virial` is the sum of f y^T over the carried nodes of each rigid body (W B,), and `moment` that of controls (W B,),
+    None without.
     """
 
     before: CoupledState
@@ -38,6 +40,8 @@ class CoupledSavedStep:
     time: float = 0.0
     lagged: list[wp.array] = field(default_factory=list)
     friction_rate: float = 0.0
+    virial: wp.array | None = None
+    moment: wp.array | None = None
 
     @property
     def frame(self) -> wp.array:
@@ -60,6 +64,7 @@ class CoupledInputs:
         elements_rate: by the rate, of every set (W E,), of forces on edges, of user-defined forces (W N,) and of friction.
         user_forces: by the parameters of each user-defined force (worlds, nodes) of all components.
         contact_parameters, radius: by the parameters of contact, see `ContactAdjoint`; None without contact.
+        moments, force, moment: by the principal moments of inertia of rigid bodies, and by their controls (W B,); None without.
     """
 
     parameters: list[wp.array]
@@ -75,6 +80,9 @@ class CoupledInputs:
     elements_rate: list[wp.array]
     contact_parameters: wp.array | None = None
     radius: wp.array | None = None
+    moments: wp.array | None = None
+    force: wp.array | None = None
+    moment: wp.array | None = None
     user_forces: list[wp.array] = field(default_factory=list)
 
 
@@ -112,6 +120,7 @@ class CoupledStepAdjoint:
     """
 
     def __init__(self, model, scheme: str | None, posed: bool = False):
+        refuse(model, scheme)
         coupled, real = model.coupled, model.types.real
         self.model, self.coupled, self.real, self.device = model, coupled, real, model.wp_device
         host, count = coupled.host, coupled.worlds * coupled.blocks
@@ -193,6 +202,13 @@ class CoupledStepAdjoint:
         if self.contact:
             self._inputs.contact_parameters, self._inputs.radius = self.contact.by_groups, self.contact.by_radius
             self._inputs.elements_rate.append(self.contact.grad_inverse_step)
+        self.bodies = None
+        if coupled.bodies:
+            self.bodies = RigidBodyAdjoint(model, self.solve.system.rigid_bodies, self._shares, self._inputs.damping)
+            gradients = self.bodies.gradients
+            for name in ("moments", "force", "moment"):
+                setattr(self._inputs, name, getattr(gradients, name))
+            self._inputs.elements_rate.append(gradients.rate)
 
     @property
     def kernels(self) -> list:
@@ -200,6 +216,7 @@ class CoupledStepAdjoint:
         result = [*self._vjp, *(kernel for kernel in self._strains if kernel)]
         result += [self._solution, self._inertia, self._start, self._ended]
         parts = (self._shares, self.solve, self.supports, *self.forces, self.predictor, self.contact)
+        parts += (self.bodies,)
         return result + [kernel for part in parts if part for kernel in part.kernels]
 
     def suit(self, step, s: float) -> bool:
@@ -230,8 +247,15 @@ class CoupledStepAdjoint:
             solved = replace(solved, frame=wp.clone(frame), lag=[wp.clone(values) for values in lag])
         islands = step.islands
         lagged = [wp.clone(values) for values in step.newton.contact.solutions] if self.contact else []
+        bodies = {}
+        if self.bodies:
+            struct = step.newton.rigid_bodies.bodies
+            bodies = {
+                "virial": wp.clone(struct.virial),
+                "moment": wp.clone(struct.moment) if step.bodies.pushed else None,
+            }
         return CoupledSavedStep(
-            before, solved, wp.clone(islands.substep_fraction), wp.clone(islands.retries), lagged=lagged
+            before, solved, wp.clone(islands.substep_fraction), wp.clone(islands.retries), lagged=lagged, **bodies
         )
 
     def vjp(
@@ -272,17 +296,22 @@ class CoupledStepAdjoint:
             by_predicted.zero_()
             tangents = lagged.q if self._midpoint else tangents
             solved = replace(solved, frame=lagged.frame, lag=lagged.lag)
+        self._rates.fill_(rate)
+        step = self._rates, self._damping
+        if self.bodies:
+            solved = self.bodies.begin(kept, solved, rate, rate * (rate + self.model.scene.mass_damping))
         if self._midpoint:
             ended = self._end
             self._launch(self._ended, len(ended), [solved.q, before.q], [ended])
         shares.uncarry(solved, after, ended, frame, of_end, by_end, inputs.end_data, carried, own_rows)
+        if self.bodies:
+            cotangent = self.bodies.end(before, solved, after, cotangent, by_end, step)
         # the solve
         if self._quadratic:
             self._quadratic.resist(before, tangents, rate)
         if self.user_forces:
             self.user_forces.begin(before, kept.time if s == np.inf else None)
         points, components, grid = coupled.points, coupled.components, (coupled.worlds, coupled.blocks)
-        self._rates.fill_(rate)
         end, out, began, more = *map(coupled.node_state, (cotangent, start, before)), components(by_end)
         masses = [coupled.mass.transpose((1, 0)), None]
         read = [end, more, *masses, self._resisted, coupled.count, last, self._rates]
@@ -296,7 +325,10 @@ class CoupledStepAdjoint:
             if self.contact:
                 rates = after.rate, before.rate if lag_q is before.q else None
                 self.contact.system.find(lag_q, before.q, q, self._friction_rate, rates)
-            self.solve(damped, rate, kept.time, grad_q, w, factors, rough)
+            if self.bodies:
+                self._solve_bodies(damped, rate, kept, grad_q, w, factors)
+            else:
+                self.solve(damped, rate, kept.time, grad_q, w, factors, rough)
             shares.clear()
             for i, kernel in enumerate(self._vjp):
                 written = [shares.slots[i], shares.lags[i], inputs.parameters[i]]
@@ -324,6 +356,8 @@ class CoupledStepAdjoint:
                     self.contact.roll(q, before.q, start.q, grad_q)
             if lag_q is not before.q and lag_q is not q:
                 self.solve.vjp_by_lagged(cotangents.lagged, grad_q)
+        if self.bodies:
+            self.bodies.pull(solved, w, grad_q, step)
         if self.solve.held is not None:
             wp.map(wp.add, grad_q, self.solve.held, out=grad_q)
         if self.supports:
@@ -337,6 +371,8 @@ class CoupledStepAdjoint:
                 shares.uncarry(before, lagged, lagged.q, carried, own_rows, *written)
                 carried, own_rows = carried_first, first
             predictor.vjp(before, grad_q, start, inputs.rate)
+        if self.bodies:
+            self.bodies.depart(before, solved, carried, own_rows, inputs.data, start, step)
         start.frame, start.lag = carried, own_rows
         if s < np.inf:
             self.solve.stays(grad_q, cotangents.stays)
@@ -344,6 +380,15 @@ class CoupledStepAdjoint:
         read += [self._resisted, coupled.count, last, self._rates]
         self._launch(self._start, grid, read, [out, points(inputs.rate)])
         return start, inputs
+
+    def _solve_bodies(
+        self, solved: CoupledState, rate: float, kept, grad_q: wp.array, w: wp.array, factors: bool
+    ) -> None:
+        """Write w with rigid bodies, carried nodes included."""
+        self.solve(solved, rate, kept.time, self.bodies.condense(grad_q), w, factors)
+        for _ in range(CORRECTIONS if kept.moment is not None else 0):
+            self.solve.system.solve_again(self.bodies.correct(grad_q, solved, w), w)
+        self.bodies.spread(w)
 
     def has_overflow(self, q: wp.array) -> bool:
         """Return True if the last `vjp`, to a solution q, overflowed the pair lists and must be repeated.

@@ -21,7 +21,6 @@ from ddg_warp.capture_lock import launches, stays_here
 from ddg_warp.errors import SceneError, SolverError
 from ddg_warp.model.controls import Controls, checked
 from ddg_warp.model.coupled_model import CoupledState
-from ddg_warp.model.rigid_bodies import refuse_rigid_bodies
 from ddg_warp.model.state import State, check_state
 from ddg_warp.scene.flow import is_on_host
 
@@ -56,7 +55,6 @@ class Adjoint:
     """
 
     def __init__(self, integrator):
-        refuse_rigid_bodies("gradients", integrator.model)
         self.integrator, self.model = integrator, integrator.model
         refuse_flow("gradients", integrator.model.scene)
         refuse_gyroscopic("Adjoint", integrator.gyroscopic)

@@ -41,7 +41,7 @@ def bodies_type(real):
     `origins`, `spins`, `carried`, `owner`, `starts`: see `ddg_warp.compile.coupled.rigid_bodies`. `y`, `derivative`: y and D of
     carried nodes (W C,). `inertia`: gamma P I P^T (W B,). `force`, `moment`: of controls, at the centre of mass (W B,). `center`:
     carried node that is the centre of mass, -1 for the origin (B,). `sum_force`, `sum_moment`: sums of all forces on bodies, inertia
-    included, with the forces along fixed dofs, written by the residual (W B,).
+    included, with the forces along fixed dofs, written by the residual (W B,). `virial`: sum of f y^T over carried nodes (W B,), too.
     """
     V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
 
@@ -59,6 +59,7 @@ def bodies_type(real):
         center: wp.array(dtype=int)
         sum_force: wp.array(dtype=V)
         sum_moment: wp.array(dtype=V)
+        virial: wp.array(dtype=M)
 
     return Bodies
 
@@ -69,7 +70,8 @@ def balance_kernel(real, linear, quadratic: bool, contact: bool):
 
     Carried nodes have no residual of their own; their energy changes stay with them.
     """
-    V, Meeting, Bodies = wp.types.vector(3, real), meeting_type(real, linear), bodies_type(real)
+    V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
+    Meeting, Bodies = meeting_type(real, linear), bodies_type(real)
     Given, Found, H = inputs_type(real, quadratic), results_type(real, linear), wp.types.vector(3, linear)
     (outer, settle), add = residual_functions(real, linear, quadratic, contact), elements_function(real, linear)
     largest, (_, transposed, *_) = largest_function(real), rotations(real)
@@ -108,8 +110,11 @@ def balance_kernel(real, linear, quadratic: bool, contact: bool):
         moment_stiff += wp.max(wp.get_diag(K))
         pushed = V(bodies.force[body])
         turned = V(bodies.moment[body])
+        virial = M()
         if bodies.center[b] >= 0:
-            turned += wp.cross(bodies.y[bodies.center[b] + carried], pushed)
+            center_arm = bodies.y[bodies.center[b] + carried]
+            turned += wp.cross(center_arm, pushed)
+            virial += wp.outer(pushed, center_arm)
         force += pushed
         size += largest(pushed)
         change -= wp.dot(pushed, inputs.q[center] - inputs.base[center])
@@ -129,6 +134,7 @@ def balance_kernel(real, linear, quadratic: bool, contact: bool):
             size += f_size
             stiff += f_stiff
             moment += wp.transpose(bodies.derivative[j + carried]) * f
+            virial += wp.outer(f, y)
             moment_size += f_size * arm
             moment_stiff += f_stiff * arm * arm
             outputs.rhs[i] = H()
@@ -139,6 +145,7 @@ def balance_kernel(real, linear, quadratic: bool, contact: bool):
             outputs.rounding_error[w, k_j] = f_rounding
         bodies.sum_force[body] = force
         bodies.sum_moment[body] = moment
+        bodies.virial[body] = virial
         scale = scalars[LOAD_SCALE, w]
         settle(inputs, outputs, flags, scale, center, k, w, force, size, stiff, change, rounding)
         settle(inputs, outputs, flags, scale, spin, s, w, moment, moment_size, moment_stiff, work, moment_rounding)

@@ -70,32 +70,44 @@ def rotation_functions(real):
 
 
 @cache
-def flight_function(real):
-    """Return the device function `flight(R, l, I, h)`: the orientation after torque-free flight over h."""
+def flight_functions(real):
+    """Return the device functions `parts`, `part` and `flight` of torque-free flight.
+
+    `parts(R, l, I, h)`: number of substeps of a flight over h. `part(R, l, I, h)`: rotation vector u of a substep in the body's axes.
+    `flight(R, l, I, h)`: the orientation after h.
+    """
     V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
     turned, *_ = rotations(real)
     matrix, _, orthonormal = rotation_functions(real)
     small = 1e-6 if real is wp.float32 else 1e-15
 
     @wp.func
-    def flight(R: M, momentum: V, moments: V, h: real):
+    def parts(R: M, momentum: V, moments: V, h: real):
         spin = wp.length(wp.cw_div(wp.transpose(R) * momentum, moments))
-        parts = wp.max(1, int(wp.ceil(h * spin / real(wp.static(FLIGHT_ANGLE)))))
-        step = h / real(parts)
+        return wp.max(1, int(wp.ceil(h * spin / real(wp.static(FLIGHT_ANGLE)))))
+
+    @wp.func
+    def part(R: M, momentum: V, moments: V, step: real):
+        p = wp.transpose(R) * momentum
+        u = wp.cw_div(p, moments) * step
+        for _iteration in range(wp.static(FLIGHT_ITERATIONS)):
+            half = turned(u * real(-0.5), p)
+            r = wp.cw_mul(moments, u) - half * step
+            if wp.length(r) <= real(wp.static(small)) * step * wp.length(momentum):
+                break
+            u = u - wp.inverse(wp.diag(moments) - wp.skew(half) * (real(0.5) * step)) * r
+        return u
+
+    @wp.func
+    def flight(R: M, momentum: V, moments: V, h: real):
+        count = parts(R, momentum, moments, h)
+        step = h / real(count)
         result = R
-        for _part in range(parts):
-            p = wp.transpose(result) * momentum
-            u = wp.cw_div(p, moments) * step
-            for _iteration in range(wp.static(FLIGHT_ITERATIONS)):
-                half = turned(u * real(-0.5), p)
-                r = wp.cw_mul(moments, u) - half * step
-                if wp.length(r) <= real(wp.static(small)) * step * wp.length(momentum):
-                    break
-                u = u - wp.inverse(wp.diag(moments) - wp.skew(half) * (real(0.5) * step)) * r
-            result = orthonormal(result * matrix(u))
+        for _part in range(count):
+            result = orthonormal(result * matrix(part(result, momentum, moments, step)))
         return result
 
-    return flight
+    return parts, part, flight
 
 
 @cache
@@ -107,7 +119,7 @@ def predict_kernel(real, midpoint: bool):
     Launched over (worlds, bodies) after the predictor of dof blocks; skips worlds that have finished their step.
     """
     V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
-    flight, (matrix, vector, _) = flight_function(real), rotation_functions(real)
+    (*_, flight), (matrix, vector, _) = flight_functions(real), rotation_functions(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def predict(

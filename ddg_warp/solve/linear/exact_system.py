@@ -5,6 +5,7 @@ import warp as wp
 
 from ddg_warp import device_arrays
 from ddg_warp.kernels.adjoint.coupled_linear_solve import block_kernels, check_kernels
+from ddg_warp.kernels.adjoint.rigid_bodies import solve_kernels
 from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.coupled_element import coupled_storage
@@ -16,6 +17,7 @@ from ddg_warp.solve.linear.rod_substructuring import RodSubstructuring
 from ddg_warp.solve.linear.skew_supports import SkewSupports
 from ddg_warp.solve.linear.solver_selection import coupled_preconditioner
 from ddg_warp.solve.linear.sparse_system import SparseSystem
+from ddg_warp.solve.newton.rigid_bodies import RigidBodies
 
 
 class ExactSystem:
@@ -61,6 +63,15 @@ class ExactSystem:
             self.substructuring.bind(self.sparsity, [], self.linear, (), quadratic)
             if contact:
                 contact.hessian.bind(self.substructuring)
+        self.rigid_bodies = None
+        if coupled.bodies:
+            outer = contact is not None or user_forces is not None
+            self.rigid_bodies = RigidBodies(
+                coupled.bodies, self.sparsity, self.linear, inertia is not None, quadratic, outer
+            )
+            _, self._stiffen, *_ = solve_kernels(real, self.linear)
+            if contact and self.substructuring:
+                self.substructuring.add_contact(contact.hessian.diagonal, self.rigid_bodies.cross)
         self.islands = Islands(worlds, real, device)
         wanted = self.islands.needs_direction
         self.system = LinearSystem.of(coupled, self.sparsity, self.substructuring, self.linear, wanted, wanted)
@@ -72,7 +83,7 @@ class ExactSystem:
             element_path.term_kernels(coupled_storage(part.term, real), 0, real)[2] for part in coupled.sets
         ]
         sizes = [part.term.measure.size for part in coupled.sets]
-        largest = max(part.elements * size**2 for part, size in zip(coupled.sets, sizes, strict=True))
+        largest = max((part.elements * size**2 for part, size in zip(coupled.sets, sizes, strict=True)), default=0)
         hessians, count = make(worlds * largest, real), [worlds * part.elements for part in coupled.sets]
         self._written = [hessians[: n * size**2].reshape((n, size, size)) for n, size in zip(count, sizes, strict=True)]
         self._no_stress = make((0, 0), real)
@@ -87,6 +98,7 @@ class ExactSystem:
             multilevel,
             indefinite=True,
             user_forces=user_forces,
+            rigid_bodies=self.rigid_bodies,
         )
 
     @property
@@ -98,20 +110,28 @@ class ExactSystem:
             if part
         ]
         result = [self._begin, self._add, self._into, self._back, self._keep, self._rest, self._check]
+        if self.rigid_bodies:
+            result += [self._stiffen, *self.rigid_bodies.matrix_kernels]
         return [*result, *self._hessians, *(kernel for kernels in used for kernel in kernels)]
 
     def solve(self, state: CoupledState, coefficient: float, rate: wp.array, rhs: wp.array, w: wp.array) -> None:
         """Write w (W N,), zero at fixed dofs, where g (W N,) is ignored. Launches only.
 
         Args:
-            state: the solution with its lagged data and the strains of the last step.
+            state: the solution with its lagged data and the strains of the last step. Carried nodes of rigid bodies have been placed
+                there in `rigid_bodies`.
             coefficient: c [1/s^2].
             rate: inverse time of strain-rate damping of every world [1/s].
         """
-        system = self.system
-        system.wanted.fill_(1)
+        self.system.wanted.fill_(1)
         self.islands.inertia_coefficient.fill_(coefficient)
         self.assemble(state, rate)
+        self.solve_again(rhs, w)
+
+    def solve_again(self, rhs: wp.array, w: wp.array) -> None:
+        """Write w for another right-hand side, with the matrix of the last `solve`."""
+        system = self.system
+        system.wanted.fill_(1)
         self._launch(self._into, len(rhs), [rhs], [system.rhs])
         if self.planes:
             self.planes.into(system.rhs, system.wanted)
@@ -153,12 +173,18 @@ class ExactSystem:
                 table.positions,
             ]
             self._launch(self._add, every, read, [system.matrix])
+        if self.rigid_bodies:
+            self.rigid_bodies.condense(mass, self.islands, system.matrix)
+            read = [self.rigid_bodies.bodies, state.q, self.coupled.blocks, table.diagonal, table.positions]
+            self._launch(self._stiffen, (self.coupled.worlds, len(self.coupled.bodies)), read, [system.matrix])
         if self.planes:
             self.planes.matrix(system.matrix, system.wanted)
         if self.substructuring:
             self.substructuring.bands.assemble(system.matrix, mass, self.islands)
         if self.contact:
             self.contact.hessian.assemble()
+            if self.rigid_bodies:
+                self.rigid_bodies.condense_contact(self.contact.hessian.diagonal)
             self.contact.hessian.add_to_bands(flags)
 
     def check(self) -> None:

@@ -29,7 +29,7 @@ class RigidBodies:
     """
 
     def __init__(self, tables, sparsity, linear, quadratic: bool, inertia_structs: bool, outer: bool):
-        self.tables, self.sparsity, self.coupled = tables, sparsity, tables.coupled
+        self.tables, self.sparsity, self.coupled, self.linear = tables, sparsity, tables.coupled, linear
         self._touches = tables.coupled.host.contact_parameters is not None
         coupled, real, device = tables.coupled, tables.coupled.real, tables.coupled.device
         worlds, bodies, carried = coupled.worlds, len(tables), len(tables.host.carried)
@@ -39,7 +39,7 @@ class RigidBodies:
             setattr(struct, name, getattr(tables, name))
         struct.y = wp.zeros(worlds * carried, dtype=coupled.vector, device=device)
         struct.derivative = wp.zeros(worlds * carried, dtype=tables.matrix, device=device)
-        struct.inertia = wp.zeros_like(self.predicted)
+        struct.inertia, struct.virial = (wp.zeros_like(self.predicted) for _ in range(2))
         for name in ("force", "moment", "sum_force", "sum_moment"):
             setattr(struct, name, wp.zeros(worlds * bodies, dtype=coupled.vector, device=device))
         struct.center = tables.center
@@ -63,12 +63,16 @@ class RigidBodies:
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
+        return [self._balance, *self.matrix_kernels]
+
+    @property
+    def matrix_kernels(self) -> list:
+        """Kernels of carried nodes and of linear systems."""
         contact = [self._gather, self._condense_diagonal, self._condense_product, self._turn]
         contact += [self._measure, self._shorten, self._note]
         return [
             self._place,
             self._spread,
-            self._balance,
             self._condense,
             self._factorise,
             self._apply,
