@@ -285,6 +285,7 @@ class CoupledStepAdjoint:
                 read = [coupled.elements(after, i), cotangent.last[i]]
                 self._over(i, kernel, read, [shares.slots[i], shares.lags[i], inputs.parameters[i]])
         shares.collect(by_end, frame, inputs.end_data)
+        coupled.reset_spins(by_end)  # rotations are zero at the end of every step: ghosts have them
         for part, rows, lag in zip(coupled.sets, of_end, cotangent.lag, strict=True):
             if part.term.measure.advance:
                 wp.copy(rows, lag)
