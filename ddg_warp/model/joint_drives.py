@@ -7,6 +7,7 @@ import numpy as np
 from ddg_warp import argument_checks
 
 REST, TORQUE = "rest_6", "torque"  # driven parameters of the term "hinge": angle and torque
+PARAMETERS = {"angles": REST, "torques": TORQUE}  # by the name of the control
 
 
 class JointDrives:
@@ -15,12 +16,14 @@ class JointDrives:
     Attributes:
         joints: the hinges, `BodyJoint`, in the order of `Controls.angles`.
         driven: mask of hinges with a driven angle, or with a spring (hinges,).
+        places: element sets with hinges, and the indices of the hinges in one of their parameters (worlds, hinges).
+        kept: True while the values in memory stay, whatever `to` is given.
     """
 
     def __init__(self, model):
         self.joints = [joint for joint in model.scene.body_joints if joint.call == "hinge"]
         self.driven = np.array([joint.angle is not None or joint.spring is not None for joint in self.joints], bool)
-        self._worlds, self._tables = model.worlds, []
+        self.places, self.kept = [], False
         numbers = [i for i, joint in enumerate(model.scene.body_joints) if joint.call == "hinge"]
         for part in model.coupled.sets if numbers else ():
             if part.term.name == "hinge":
@@ -28,7 +31,7 @@ class JointDrives:
                 index = np.array([element[number] for number in numbers])
                 for name in (REST, TORQUE):
                     part.parameters.prescribe(name, (model.worlds, part.elements))
-                self._tables.append((part.parameters, index + part.elements * np.arange(model.worlds)[:, None]))
+                self.places.append((part, index + part.elements * np.arange(model.worlds)[:, None]))
 
     def to(self, t: float, factor: float = 1.0, controls: Mapping | None = None) -> None:
         """Write the values at a time, or at a load parameter `factor` of statics, which scales constant torques.
@@ -39,7 +42,7 @@ class JointDrives:
         Raises:
             SolverError: a function failed, or its value does not fit; the message names the hinge.
         """
-        if not self.joints:
+        if not self.joints or self.kept:
             return
         controls = controls or {}
         angles, torques = (
@@ -48,9 +51,9 @@ class JointDrives:
         )
         angles = controls.get("angles", angles)
         torques = torques + factor * controls.get("torques", 0.0)
-        for table, index in self._tables:
-            table.write(REST, [(index, np.broadcast_to(np.where(self.driven, angles, 0.0), index.shape))])
-            table.write(TORQUE, [(index, np.broadcast_to(torques, index.shape))])
+        for part, index in self.places:
+            part.parameters.write(REST, [(index, np.broadcast_to(np.where(self.driven, angles, 0.0), index.shape))])
+            part.parameters.write(TORQUE, [(index, np.broadcast_to(torques, index.shape))])
 
 
 def _value(number: int, joint, label: str, t: float, factor: float) -> float:

@@ -1,10 +1,13 @@
 """Controls of a step (loads, grip poses, field), and gradients with respect to them."""
 
+from contextlib import contextmanager
+
 import numpy as np
 import torch
 import warp as wp
 
 from ddg_warp.kernels.core import outcome
+from ddg_warp.model.joint_drives import PARAMETERS
 from ddg_warp.solve.forces.control_loads import LOADS
 from ddg_warp.solve.forces.prescribed_motion import counts_revolutions, rotations_between
 from ddg_warp.torch.state_layout import view
@@ -38,6 +41,13 @@ class StepControls:
                     target.copy_(value - self._usual if name == "gravity" else value)
                 else:
                     target.zero_()
+        if model.coupled is not None and model.coupled.bodies:
+            struct, wrenches = integrator._coupled.newton.rigid_bodies.bodies, controls.get("wrenches")
+            for k, target in enumerate((view(struct.force), view(struct.moment))):
+                if wrenches is None:
+                    target.zero_()
+                else:
+                    target.copy_(wrenches[..., 3 * k : 3 * k + 3].reshape(-1, 3))
         self.give_field(controls)
         if model.grips:
             target = view(engine.after.grips.pose)
@@ -71,6 +81,48 @@ class StepControls:
             target.copy_(controls["field"].T)
         else:
             target.zero_()
+
+    def give_drives(self, t: float, controls: dict) -> None:
+        """Write angles and torques of hinges at a time to parameter memory: of the scene, then tensors."""
+        drives = self.model.drives
+        drives.to(t)
+        for name, parameter in PARAMETERS.items() if drives.joints else ():
+            if name not in controls:
+                continue
+            for part, index in self._hinges():
+                table, value = part.parameters, controls[name]
+                memory = view(table.buffer).narrow(0, table.offsets[parameter], self.model.worlds * part.elements)
+                memory[index] = memory[index] + value if name == "torques" else value * self._driven
+
+    @contextmanager
+    def driven(self):
+        """Keep what `give_drives` has written."""
+        self.model.drives.kept = True
+        try:
+            yield
+        finally:
+            self.model.drives.kept = False
+
+    def _hinges(self) -> list[tuple]:
+        """Return element sets with hinges, and the indices of the hinges (worlds, hinges) as tensors."""
+        drives = self.model.drives
+        indices = self.layout.places("hinges", lambda: [index for _, index in drives.places])
+        return [(part, index) for (part, _), index in zip(drives.places, indices, strict=True)]
+
+    @property
+    def _driven(self) -> torch.Tensor:
+        """Mask of hinges with a driven angle, or with a spring (hinges,)."""
+        (driven,) = self.layout.places("driven", lambda: [self.model.drives.driven])
+        return driven
+
+    def _by_drive(self, name: str, inputs: list, flags) -> torch.Tensor:
+        """Return the gradient with respect to angles or torques of hinges (worlds, hinges)."""
+        total = 0.0
+        for part, index in self._hinges():
+            row = list(part.parameters.values).index(PARAMETERS[name])
+            gradient = view(inputs[-1].parameters[self.model.coupled.sets.index(part)])[row]
+            total = total + gradient[index]
+        return total * flags[-1][:, None] * (self._driven if name == "angles" else 1.0)
 
     def give_fields(self, t: float, controls: dict) -> None:
         """Write the fields at a time to parameter memory, of the scene, then tensors; worlds that are not finite are invalid."""
@@ -138,6 +190,13 @@ class StepControls:
         """Return the gradient with respect to a control of a step, or of an equilibrium at full load (worlds, ...)."""
         if name == "poses":
             return self.engine.by_poses * self.layout.by_world(flags)[:, None, None]
+        if name in PARAMETERS:
+            return self._by_drive(name, inputs, flags)
+        if name == "wrenches":
+            by_wrench = [
+                view(values).reshape(self.model.worlds, -1, 3) for values in (inputs[-1].force, inputs[-1].moment)
+            ]
+            return torch.cat(by_wrench, -1) * flags[-1][:, None, None]
         result = torch.zeros_like(value)
         model, worlds = self.model, self.model.worlds
         if name.startswith(FIELD):

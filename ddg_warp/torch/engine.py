@@ -19,7 +19,6 @@ from ddg_warp.capture_lock import alone
 from ddg_warp.kernels.adjoint.time_step import flag_kernels, requested_kernels, smooth_kernel
 from ddg_warp.model.controls import Controls
 from ddg_warp.model.rebuild import ModelBuilder
-from ddg_warp.model.rigid_bodies import refuse_rigid_bodies
 from ddg_warp.model.state import Sliding
 from ddg_warp.solve.equilibrium import statics
 from ddg_warp.solve.stepping.graph_cache import Graphs
@@ -54,7 +53,6 @@ class Engine:
     """
 
     def __init__(self, source, worlds: int, scheme: str, options: dict):
-        refuse_rigid_bodies("Simulator", source)
         recipe = ModelBuilder(source, worlds)
         self.model = model = recipe.build()
         self._version = recipe.version
@@ -111,7 +109,9 @@ class Engine:
         integrator._prepare(dt, self.before)
         self.controls.give(controls)
         self.controls.give_fields(integrator.evaluation_time(start, dt), controls)
-        integrator.advance(0, start, dt, anew=True)
+        self.controls.give_drives(integrator.evaluation_time(start, dt), controls)
+        with self.controls.driven():
+            integrator.advance(0, start, dt, anew=True)
         s = integrator._solved(dt)
         wp.copy(self._codes, self._outcome_codes)
         results = copies(self.target) + [self._smooth(part, s, graded) for part in integrator._parts]
@@ -130,9 +130,17 @@ class Engine:
 
     @property
     def solutions(self) -> list[wp.array]:
-        """Solutions of the friction iterations of the coupled system, see `NewtonContact`."""
+        """Data of the solve of the coupled system that no state has.
+
+        These are the solutions of the friction iterations, see `NewtonContact`, then `virial` of rigid bodies, see
+        `kernels.rigid_bodies.condensation`.
+        """
         coupled = self.integrator._coupled
-        return coupled.newton.contact.solutions if coupled is not None and coupled.newton.contact else []
+        if coupled is None:
+            return []
+        newton = coupled.newton
+        bodies = [newton.rigid_bodies.bodies.virial] if newton.rigid_bodies else []
+        return [*(newton.contact.solutions if newton.contact else []), *bodies]
 
     def lagged(self) -> list[torch.Tensor]:
         """Return copies of the `solutions` of the step just made, for the backward pass."""
@@ -207,6 +215,10 @@ class Engine:
         self.controls.give_field(controls)
         self.controls.give_gravity(controls, adjoint)
         self.controls.give_fields(self.integrator.evaluation_time(start, dt), controls)
+        self.controls.give_drives(self.integrator.evaluation_time(start, dt), controls)
+        pushed = self.model.rigid_bodies is not None and "wrenches" in controls
+        if pushed:
+            view(self._moment).copy_(controls["wrenches"][..., 3:].reshape(-1, 3))
         self._fill_all((before, after, cotangent), other_results)
         if adjoint.upload(start, dt):
             self._graphs.clear()
@@ -218,7 +230,8 @@ class Engine:
             for middle, *ends in ((kept.x, end.x, kept.before.x), (kept.theta, end.theta, kept.before.theta)):
                 torch.mul(sum(view(array) for array in ends), 0.5, out=view(middle))
         if adjoint.coupled:
-            parts.append(self._net_kept(start, dt))
+            kept = self._net_kept(start, dt)
+            parts.append(replace(kept, moment=self._moment) if pushed else kept)
 
         def launch():
             if not between:
@@ -226,10 +239,10 @@ class Engine:
             self._found = adjoint.vjp_of_parts(self.before, self.after, parts, self._given, s)
             self._judge()
 
-        self._graphs.replay(dt, launch)
+        self._graphs.replay((dt, pushed), launch)
         while adjoint.has_overflow(parts):
             self._graphs.clear()
-            self._graphs.replay(dt, launch)
+            self._graphs.replay((dt, pushed), launch)
         by_start, inputs = self._found
         if self.poses:
             ends = self.before, self.after
@@ -272,6 +285,8 @@ class Engine:
         coupled = worlds.start.coupled
         for array in self._coupled.lagged if coupled else ():
             worlds.take_array(mask, coupled.q, array, self.model.worlds)
+        if coupled and self._coupled.virial is not None:
+            worlds.take_array(mask, self._no_virial, self._coupled.virial, self.model.worlds)
 
     def _judge(self) -> None:
         """Compute the flags of a backward pass; launches only."""
@@ -323,9 +338,11 @@ class Engine:
                 if self.midpoint:
                     data = {index: wp.clone(values) for index, values in data.items()}
                 solved = replace(before, q=wp.clone(before.q), data=data)
-                self._coupled = CoupledSavedStep(
-                    before, solved, None, lagged=[wp.clone(values) for values in self.solutions]
-                )
+                lagged, virial = [wp.clone(values) for values in self.solutions], None
+                if self.model.coupled.bodies:
+                    *lagged, virial = lagged
+                    self._no_virial, self._moment = wp.zeros_like(virial), wp.zeros_like(before.momentum)
+                self._coupled = CoupledSavedStep(before, solved, None, lagged=lagged, virial=virial)
                 self._turned = wp.clone(before.q)  # scratch
             self.adjoint = adjoint
             self._make_flags()
@@ -351,7 +368,10 @@ class Engine:
             for dtype in (model.types.real, model.types.real, int)
         ]
         self._flag_tensors = [view(result_flags) for result_flags in self._flags[1]]
-        kept = self._coupled.lagged if self.adjoint.coupled else []
+        kept = []
+        if self.adjoint.coupled:
+            virial = self._coupled.virial
+            kept = [*self._coupled.lagged, *([] if virial is None else [virial])]
         self._output_places = [view(place) for place in (*self._flags[0], self._codes_then, *kept)]
 
     def _load(self) -> None:

@@ -9,6 +9,7 @@ from ddg_warp.errors import SceneError
 from ddg_warp.scene.grip import Grip
 from ddg_warp.torch.gradient_check_scenes import scene_of
 from ddg_warp.torch.named_parameters import MASSES, of_sections
+from ddg_warp.torch.rotations import matrix, quaternion
 from ddg_warp.torch.simulator import Simulator, WorldState
 
 WORLDS, DT, STEPS = 2, 0.01, 2
@@ -71,6 +72,8 @@ class Case:
         points, edges = self.model.points_count, self.model.order.edges_count
         shape = (WORLDS, points, 3)
         self.weights = self._normal(*shape), 0.1 * self._normal(*shape), 0.1 * self._normal(WORLDS, edges)
+        bodies = self.bodies = len(self.model.scene.bodies)
+        self.body_weights = self._normal(WORLDS, bodies, 3, 4), 0.1 * self._normal(WORLDS, bodies, 6)
         # start poses of equilibria: angles are measured from frames transported to there
         self.poses = 1e-3 * self._normal(WORLDS, len(self.model.grips), 6)
         self.posed = {"poses": self.poses} if self.model.grips else {}
@@ -102,6 +105,9 @@ class Case:
             values = self.engine.layout.turn_edges(
                 values, "omega", "v", 3.0 * self._normal(WORLDS, self.model.order.edges_count)
             )
+            if self.bodies:
+                rates = self._normal(WORLDS, self.bodies, 6) * self._tensor([0.3] * 3 + [3.0] * 3)
+                values = self.engine.layout.bodies.put(values, None, state.body_rates + rates)
         return replace(state, values=tuple(values))
 
     def _rates(self) -> torch.Tensor:
@@ -121,6 +127,8 @@ class Case:
             pairs.append((self.weights[2], state.angles))
         if not self.statics:
             pairs.append((self.weights[1], state.velocities))
+        if self.bodies:
+            pairs += zip(self.body_weights, (state.body_poses, state.body_rates), strict=True)
         copies = len(state.codes) // WORLDS
         return sum((values.view(copies, *weights.shape) * weights).flatten(1).sum(1) for weights, values in pairs)
 
@@ -176,6 +184,7 @@ class Case:
                 yield self._state(
                     "spins", 10.0, lambda x: self.engine.layout.turn_edges(self.state.values, "omega", "v", x * spin)
                 )
+            yield from self._of_bodies()
         for name in self.engine.tables.names():
             yield self._parameter(name)
         yield self._control("forces", 1e-2, self._normal(WORLDS, points, 3) * self.axes)
@@ -183,13 +192,54 @@ class Case:
             yield self._control("moments", 1e-4, self._normal(WORLDS, edges))
         if self.model.grips:
             yield self._control("poses", 0.1, self._normal(WORLDS, len(self.model.grips), 6), self.poses)
-        yield self._control("gravity", 10.0, self._normal(WORLDS, 3) * self.down, gravity)
+        if self.bodies:
+            size = self._tensor([1.0] * 3 + [1e-2] * 3)
+            yield self._control("wrenches", 0.1, self._normal(WORLDS, self.bodies, 6) * size)
+        if hinges := len(self.model.drives.joints):
+            yield self._control("torques", 1e-3, self._normal(WORLDS, hinges))
+            yield self._control("angles", 0.1, self._normal(WORLDS, hinges), self._tensor(self._driven_angles()))
+        if not any(joint.first < 0 for joint in self.model.scene.body_joints):  # whose weight is a load
+            yield self._control("gravity", 10.0, self._normal(WORLDS, 3) * self.down, gravity)
         if self.model.magnetic:
             yield self._control("field", 1e-2, self._normal(WORLDS, 3) * self.axes)
         if not self.statics:
             yield self._shared("time step", DT, self._by_step, self._without_step())
             yield self._shared("mass damping", 1.0, lambda x: self.end(self.built(mass_damping=0.7 + x)))
-        yield self._density()
+        if not self.bodies:  # which carry masses of rods
+            yield self._density()
+
+    def _of_bodies(self) -> Iterator[Input]:
+        """Yield poses and rates of rigid bodies; pinned ones rotate about their joint with the world."""
+        if not self.bodies:
+            return
+        layout, rigid = self.engine.layout.bodies, self.model.coupled.host.rigid_bodies
+        rotation, place = self.state.body_poses.split([3, 1], -1)
+        pinned = torch.as_tensor(rigid.pinned, device=self.place)[:, None, None]
+        pivot = self._tensor(self.model.coupled.host.rest[rigid.origins])[..., None]
+        shift, axis, rate = (self._normal(WORLDS, self.bodies, 3) for _ in range(3))
+
+        def posed(poses: tuple) -> list:
+            return layout.put(self.state.values, torch.cat(poses, -1), self.state.body_rates)
+
+        def turned(x) -> list:
+            turn = matrix(quaternion(x * axis))
+            return posed((turn @ rotation, torch.where(pinned, pivot + turn @ (place - pivot), place)))
+
+        def shifted(x) -> list:
+            return posed((rotation, torch.where(pinned, place, place + x * shift[..., None])))
+
+        def moved(x, k: int) -> list:
+            more = torch.cat([rate * x * float(k == 0), rate * x * float(k == 1)], -1)
+            return layout.put(self.state.values, None, self.state.body_rates + more)
+
+        yield self._state("body positions", 0.1, shifted)
+        yield self._state("body orientations", 1.0, turned)
+        yield self._state("body velocities", 1.0, lambda x: moved(x, 0))
+        yield self._state("body angular velocities", 10.0, lambda x: moved(x, 1))
+
+    def _driven_angles(self) -> list[float]:
+        """Return the driven angles of hinges, zero without."""
+        return [joint.angle or 0.0 for joint in self.model.drives.joints]
 
     def _moved(self, array: str, blocks: str, shift: torch.Tensor) -> list:
         points = self.engine.layout.points(self.state.values, array, blocks)

@@ -172,6 +172,21 @@ def _over_plane(scene: Scene, shell: int) -> None:
     _add_contact(scene, "barrier")
 
 
+def _with_bodies(scene: Scene, rod: int) -> None:
+    """Add a body clamped to the end of a rod, one hinged to it with a motor, and one that hangs from the world by a spring."""
+    first, second = CURVE[-1] + (0.02, 0.01, 0.0), CURVE[-1] + (0.05, 0.03, 0.02)
+    bodies = [
+        scene.add_body(mass=0.02, inertia=(2e-5, 3e-5, 4e-5), center=first, angular_velocity=(3.0, 4.0, 5.0)),
+        scene.add_body(mass=0.01, inertia=(1e-5, 2e-5, 1e-5), center=second, angular_velocity=(1.0, -2.0, 3.0)),
+        scene.add_body(mass=0.03, inertia=(2e-5, 1e-5, 3e-5), center=(0.0, 0.3, -0.05)),
+    ]
+    scene.attach(rod, -1, bodies[0])
+    scene.hinge(
+        *bodies[:2], point=0.5 * (first + second), axis=(0.0, 1.0, 0.0), torque=1e-3, damping=1e-5, stiffness=200.0
+    )
+    scene.hinge(bodies[2], point=(0.0, 0.3, 0.0), axis=(1.0, 0.0, 0.0), angle=0.1, spring=1e-3, stiffness=200.0)
+
+
 def _timed(t: float) -> tuple:
     return (0.0, 2e-2 * t, 1e-2)
 
@@ -237,6 +252,7 @@ OBJECTS: dict[str, tuple[int, Callable]] = {
         3,
         _sheet("midedge_dof", lambda s, k, first: s.clamp_boundary(k, first, motion=SWING)),
     ),
+    "rod with bodies": (3, _rod(more=_with_bodies)),
     "rods in contact": (3, _crossing),
     "gripped rod that rolls another": (3, lambda s, m: _crossing(s, m, Grip(), rolling=True)),
     "rod on a gripped ball": (3, _on_ball),

@@ -3,6 +3,9 @@
     "rod.mass"       [kg] of the points of all rods, including point masses of `Scene.add_mass`
     "rod.inertia"    [kg m^2] about the tangent, of the edges of rods with twist
     "shell.mass"     [kg] of the vertices of all shells, "meridian.mass" of the nodes of all shells of revolution
+    "body.mass"      [kg] of free rigid bodies with the masses that they carry. Their centres of mass and moments of inertia stay
+    "body.inertia"   [kg m^2] principal moments of rigid bodies with the masses that they carry, three a body, about the centre of mass
+                     or the point of a joint with the world
     "FORCE.NAME"     of the edges of rods with a force of `solve.forces.force_list.WITH_PARAMETERS`, whose class describes them
     "shell_drag.normal", "shell_drag.tangential"
                      of the triangles of shells with drag [N s/m^3], in scenes with quadratic drag [kg/m^3]
@@ -13,7 +16,7 @@
 
 `contact_parameters.contact_elements` lists the owners of contact parameters in order. Points and edges are in the order of
 `State.points` and `State.angles`, triangles shell by shell. The mass of several points that are one node of the coupled system is
-the sum.
+the sum. Masses of nodes that a rigid body carries belong to the body.
 """
 
 from collections.abc import Callable, Iterator
@@ -31,11 +34,19 @@ from ddg_warp.torch.state_layout import view
 MASSES = ("rod.mass", "shell.mass", "meridian.mass")
 COEFFICIENTS = {f"{force.name}.{name}": (force, name) for force in WITH_PARAMETERS for name in force.parameters}
 SHELL_COEFFICIENTS = {"shell_drag.normal": NORMAL, "shell_drag.tangential": TANGENTIAL}
-NAMES = (*MASSES, "rod.inertia", *COEFFICIENTS, *SHELL_COEFFICIENTS, *contact_parameters.NAMES)
+BODIES = "body.mass", "body.inertia"
+NAMES = (
+    *MASSES,
+    "rod.inertia",
+    *BODIES,
+    *COEFFICIENTS,
+    *SHELL_COEFFICIENTS,
+    *contact_parameters.NAMES,
+)
 SIGNED = [f"{force.name}.{name}" for force in WITH_PARAMETERS for name in force.signed]
 POSITIVE = [
     *(f"{force.name}.{name}" for force in WITH_PARAMETERS for name in force.positive),
-    *("contact.range", "contact.radius"),  # all others must be nonnegative
+    *("contact.range", "contact.radius", *BODIES),  # all others must be nonnegative
 ]
 
 
@@ -89,7 +100,7 @@ def array_views(model, name: str) -> tuple[int, list[ArrayParameterView | contac
 
 def of_sections(model, name: str) -> np.ndarray:
     """Return the masses (E,) [kg] that sections and thicknesses contribute under a name; they scale with density."""
-    return point_masses(model)[0][_rows(model, name)]
+    return point_masses(model)[0][elements(model, name)]
 
 
 def _rows(model, name: str) -> slice:
@@ -112,6 +123,8 @@ def _parts(model, name: str) -> Iterator[_Part]:
         return _masses(model, name)
     if name in SHELL_COEFFICIENTS:
         return _shell_coefficients(model, name)
+    if name in BODIES:
+        return _bodies(model, name)
     return _inertia(model) if name == "rod.inertia" else _coefficients(model, name)
 
 
@@ -134,6 +147,8 @@ def _masses(model, name: str) -> Iterator[_Part]:
     if model.coupled is not None:
         coupled, (rows, blocks) = model.coupled, order.coupled_rows
         chosen = np.isin(rows, np.arange(order.points_count)[_rows(model, name)])
+        if coupled.bodies:
+            chosen &= ~np.isin(blocks, coupled.host.rigid_bodies.carried)
         rows, blocks = rows[chosen], blocks[chosen]
         nodes, shape = coupled.host.nodes, (coupled.worlds, coupled.blocks, 3)
         yield _Part(
@@ -148,6 +163,42 @@ def _masses(model, name: str) -> Iterator[_Part]:
             lambda inputs: view(inputs.mass).view(shape)[:, :nodes].sum(-1),
             coupled,
         )
+
+
+def _bodies(model, name: str) -> Iterator[_Part]:
+    if model.coupled is None or not model.coupled.bodies:
+        return
+    coupled, host = model.coupled, model.coupled.host
+    rigid, nodes, shape = host.rigid_bodies, host.nodes, (coupled.worlds, coupled.blocks, 3)
+    if name == "body.mass":
+        free = np.flatnonzero(~rigid.pinned)
+        places, usual = rigid.origins[free], host.mass[:nodes, 0]
+        yield _Part(
+            -1,
+            False,
+            "mass",
+            usual,
+            places,
+            free,
+            usual[places],
+            lambda: view(coupled.mass)[:, :nodes],
+            lambda inputs: view(inputs.mass).view(shape)[:, :nodes].sum(-1),
+            coupled,
+        )
+        return
+    usual = rigid.moments.ravel()
+    rows = np.arange(len(usual))
+    yield _Part(
+        -1,
+        False,
+        name,
+        usual,
+        rows,
+        rows,
+        usual,
+        lambda: view(coupled.bodies.moments).view(coupled.worlds, -1, 1),
+        lambda inputs: view(inputs.moments).view(coupled.worlds, -1),
+    )
 
 
 def _inertia(model) -> Iterator[_Part]:

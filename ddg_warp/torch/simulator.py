@@ -123,27 +123,36 @@ class Simulator(torch.nn.Module):
 
     @graph_break
     def initial_state(
-        self, batch: int | None = None, positions: Tensors | None = None, velocities: Tensors | None = None
+        self,
+        batch: int | None = None,
+        positions: Tensors | None = None,
+        velocities: Tensors | None = None,
+        body_poses: Tensors | None = None,
+        body_rates: Tensors | None = None,
     ) -> WorldState:
         """Return the first state of all worlds, at rest or with given positions and velocities.
 
         Args:
-            batch: worlds; by default the number in positions or velocities, else in the model.
+            batch: worlds; by default the number in the other arguments, else in the model.
             positions, velocities: (P, 3) or (B, P, 3). Gradients go through both. Rest frames are transported by the first step: no
                 edge may be further than 90 degrees from there. Strain-rate damping resists the motion from rest within that step;
                 `world_state` makes states without it.
+            body_poses: rotation and position of rigid bodies, [R | x], (bodies, 3, 4) or (B, bodies, 3, 4), as of
+                `WorldState.body_poses`. Nodes that bodies carry follow. Gradients are along rotations.
+            body_rates: velocity of the centre and angular velocity (bodies, 6) or (B, bodies, 6), by default those of the scene.
 
         Raises:
             SceneError: shapes do not fit, or surfaces in contact overlap (under transforms of torch, reported by steps).
         """
-        moved = {"positions": positions, "velocities": velocities}
+        moved = {"positions": positions, "velocities": velocities, "body_poses": body_poses, "body_rates": body_rates}
         for name, values in moved.items():
             if not (
                 values is None or isinstance(values, torch.Tensor) or np.isfinite(argument_checks.floats(values)).all()
             ):
                 raise SceneError(f"initial_state: {name} are {argument_checks.shown(values)}; give finite numbers")
         moved = {name: self._tensor(name, values) for name, values in moved.items() if values is not None}
-        batch_sizes = [len(values) for values in moved.values() if values.ndim == 3]
+        one = {"body_poses": 3}  # axes without worlds; others have two
+        batch_sizes = [len(values) for name, values in moved.items() if values.ndim > one.get(name, 2)]
         worlds = batch_sizes[0] if batch_sizes else self.model.worlds
         worlds = worlds if batch is None else argument_checks.count("batch", batch)
         engine = self.engine(worlds)
@@ -151,6 +160,8 @@ class Simulator(torch.nn.Module):
         for name, arrays in (("positions", ("x", "q")), ("velocities", ("v", "v"))):
             if name in moved:
                 values = engine.layout.put_points(values, *arrays, moved[name])
+        if "body_poses" in moved or "body_rates" in moved:
+            values = engine.layout.bodies.put(values, moved.get("body_poses"), moved.get("body_rates"))
         engine.check(values)
         return WorldState.begun(values, 0.0, engine)
 

@@ -1,15 +1,18 @@
 """Layout of the tensors of a state: order of arrays, and indices of points and edges."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
 import warp as wp
 
 from ddg_warp.errors import SceneError
+from ddg_warp.torch.rigid_bodies import BodyLayout
 
 # prefixes of the names of arrays that have gradients
-GRADIENTS = ("x", "v", "theta", "omega", "frame", "last", "q", "lag", "pose")
+GRADIENTS = ("x", "v", "theta", "omega", "frame", "last", "q", "lag", "pose", "rotation", "momentum")
+ALWAYS = ("net/rate", "net/rotation", "net/momentum")  # arrays that are no placeholders, whatever their size
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,7 @@ def fields(model) -> list[Field]:
     return [
         Field(name, array.ndim - 1, name.partition("/")[2].rstrip("_0123456789") in GRADIENTS)
         for name, array in model.empty_state().arrays().items()
-        if (array.size > 1 or name == "net/rate") and name != nothing
+        if (array.size > 1 or name in ALWAYS) and name != nothing
     ]
 
 
@@ -57,7 +60,7 @@ def along(values: torch.Tensor, field: Field, like: torch.Tensor) -> torch.Tenso
     count = like.shape[field.axis]
     if count != len(values):
         values = values.repeat_interleave(count // len(values))
-    return values if like.ndim == field.axis + 1 else values[:, None]
+    return values.reshape(-1, *[1] * (like.ndim - field.axis - 1))
 
 
 class StateLayout:
@@ -65,32 +68,44 @@ class StateLayout:
 
     Attributes:
         fields: fields of the tensors of a state.
+        real: their dtype.
     """
 
     def __init__(self, model):
         self.model, self.device = model, str(wp.device_to_torch(model.wp_device))
-        self.fields = fields(model)
+        self.fields, self.real = fields(model), wp.dtype_to_torch(model.types.real)
         self._places = {}
+
+    @cached_property
+    def bodies(self) -> BodyLayout:
+        """Rigid bodies.
+
+        Raises:
+            SceneError: the model has none.
+        """
+        if not self.model.scene.bodies:
+            raise SceneError("the scene has no rigid body; add one by scene.add_body(...)")
+        return BodyLayout(self)
 
     def points(self, values, array: str, blocks: str) -> torch.Tensor:
         """Return points (worlds, P, 3) from the tensors of a state."""
         model, point_arrays = self.model, []
         for i, group in enumerate(model.groups):
-            x = values[self._of(f"{i}/{array}")].reshape(-1, group.kind.dim)
+            x = values[self.index(f"{i}/{array}")].reshape(-1, group.kind.dim)
             if group.kind.dim == 2:
                 x = torch.stack([x[:, 0], torch.zeros_like(x[:, 0]), x[:, 1]], 1)
             point_arrays.append(x)
         if model.coupled is not None:
-            point_arrays.append(values[self._of(f"net/{blocks}")])
+            point_arrays.append(values[self.index(f"net/{blocks}")])
         return self._picked("points", point_arrays, self._point_rows).view(model.worlds, model.points_count, 3)
 
     def edges(self, values) -> torch.Tensor:
         """Return twist angles (worlds, edges) from the tensors of a state."""
         model = self.model
         twisted = [i for i, group in enumerate(model.groups) if group.kind.twist]
-        angles = [values[self._of(f"{i}/theta")].reshape(-1) for i in twisted]
+        angles = [values[self.index(f"{i}/theta")].reshape(-1) for i in twisted]
         if model.coupled is not None:
-            angles.append(values[self._of("net/q")][:, 0])
+            angles.append(values[self.index("net/q")][:, 0])
         none = torch.zeros(1, dtype=values[0].dtype, device=values[0].device)
         return self._picked("edges", [*angles, none], self._edge_rows).view(model.worlds, -1)
 
@@ -109,14 +124,14 @@ class StateLayout:
         points, values = points.expand(worlds, *points.shape[-2:]), list(values)
         for i, group in enumerate(model.groups):
             k, column, rows = self.places(("points", i), lambda group=group: model.order.places(group))
-            index, shape = self._of(f"{i}/{array}"), (group.nodes, worlds, group.rods, -1)
+            index, shape = self.index(f"{i}/{array}"), (group.nodes, worlds, group.rods, -1)
             new = points[:, rows][..., list(group.host.axes)]
             old = values[index].reshape(shape)
             target = k[None], torch.arange(worlds, device=k.device)[:, None], column[None]
             values[index] = old.index_put(target, new).reshape(values[index].shape)
         if model.coupled is not None:
             rows, blocks_of = self.places(("given", "net"), lambda: _last(*model.order.coupled_rows))
-            index = self._of(f"net/{blocks}")
+            index = self.index(f"net/{blocks}")
             old = values[index].reshape(worlds, -1, 3)
             target = torch.arange(worlds, device=rows.device)[:, None], blocks_of[None]
             values[index] = old.index_put(target, points[:, rows]).reshape(values[index].shape)
@@ -129,12 +144,12 @@ class StateLayout:
         for i, group in enumerate(model.groups):
             if group.kind.twist:
                 k, column, rows = self.places(("edges", i), lambda group=group: model.order.edge_places(group))
-                index = self._of(f"{i}/{array}")
+                index = self.index(f"{i}/{array}")
                 increment = torch.zeros_like(values[index]).reshape(group.nodes, worlds, group.rods)
                 increment = increment.index_put((k[:, None], world[None], column[:, None]), more[:, rows].T)
                 values[index] = values[index] + increment.reshape(values[index].shape)
         if model.coupled is not None:
-            index, (rows, owned) = self._of(f"net/{blocks}"), self.coupled_edges()
+            index, (rows, owned) = self.index(f"net/{blocks}"), self.coupled_edges()
             increment = torch.zeros_like(values[index]).reshape(worlds, -1, 3)
             increment = increment.index_put((world[:, None], owned[None], torch.zeros_like(owned)[None]), more[:, rows])
             values[index] = values[index] + increment.reshape(values[index].shape)
@@ -162,7 +177,8 @@ class StateLayout:
             self._places[key] = [torch.as_tensor(np.asarray(v), device=self.device) for v in find()]
         return self._places[key]
 
-    def _of(self, name: str) -> int | None:
+    def index(self, name: str) -> int | None:
+        """Return the index of an array of a state among its tensors, None without."""
         return next((i for i, field in enumerate(self.fields) if field.name == name), None)
 
     def _picked(self, key: str, values: list[torch.Tensor], find) -> torch.Tensor:

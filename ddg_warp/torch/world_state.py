@@ -73,6 +73,24 @@ class WorldState:
         return self.layout.edges(self.values)
 
     @property
+    @graph_break
+    def body_poses(self) -> torch.Tensor:
+        """Rotation and position of rigid bodies, [R | x], (B, bodies, 3, 4) [m], as of `State.body_poses`."""
+        return self.layout.bodies.poses(self.values)
+
+    @property
+    @graph_break
+    def body_rates(self) -> torch.Tensor:
+        """Velocity of the centre [m/s] and angular velocity [rad/s] of rigid bodies (B, bodies, 6), at the inertia of the model."""
+        return self.layout.bodies.rates(self.values)
+
+    @property
+    @graph_break
+    def body_momenta(self) -> torch.Tensor:
+        """Angular momenta of rigid bodies (B, bodies, 3) [kg m^2/s], about the centre or the point of a joint with the world."""
+        return self.layout.bodies.momenta(self.values)
+
+    @property
     def failed(self) -> torch.Tensor:
         """Mask of worlds that failed in the last step (B,)."""
         return (self.codes != 0) & (self.codes != outcome.NO_GRADIENT)

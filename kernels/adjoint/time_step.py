@@ -391,7 +391,7 @@ def requested_kernels(dtype, real):
     `asked`: mark islands with a non-zero cotangent.
     `spoil`: replace their gradients by NaN.
     """
-    several = hasattr(dtype, "_wp_scalar_type_")
+    several, square = hasattr(dtype, "_wp_scalar_type_"), len(getattr(dtype, "_shape_", ())) == 2
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def asked(
@@ -403,7 +403,10 @@ def requested_kernels(dtype, real):
         i, j, k = wp.tid()
         if wp.isnan(flags[k / per_island]):
             value = cotangent[i, j, k]
-            if wp.static(several):
+            if wp.static(square):
+                if wp.ddot(value, value) != real(0.0):
+                    has_cotangent_out[k / per_island] = 1
+            elif wp.static(several):
                 if wp.length_sq(value) != real(0.0):
                     has_cotangent_out[k / per_island] = 1
             else:

@@ -132,6 +132,7 @@ class ExactSystem:
         """Write w for another right-hand side, with the matrix of the last `solve`."""
         system = self.system
         system.wanted.fill_(1)
+        self._assemble_bands()
         self._launch(self._into, len(rhs), [rhs], [system.rhs])
         if self.planes:
             self.planes.into(system.rhs, system.wanted)
@@ -179,13 +180,17 @@ class ExactSystem:
             self._launch(self._stiffen, (self.coupled.worlds, len(self.coupled.bodies)), read, [system.matrix])
         if self.planes:
             self.planes.matrix(system.matrix, system.wanted)
+
+    def _assemble_bands(self) -> None:
+        """Assemble the blocks of the preconditioner, which each solve factorises in place."""
+        mass = self.user_forces.inertia if self.user_forces else self.mass
         if self.substructuring:
-            self.substructuring.bands.assemble(system.matrix, mass, self.islands)
+            self.substructuring.bands.assemble(self.system.matrix, mass, self.islands)
         if self.contact:
             self.contact.hessian.assemble()
             if self.rigid_bodies:
                 self.rigid_bodies.condense_contact(self.contact.hessian.diagonal)
-            self.contact.hessian.add_to_bands(flags)
+            self.contact.hessian.add_to_bands(self.islands.arrays[0])
 
     def check(self) -> None:
         """Set `failed` from the residual of the solution."""
