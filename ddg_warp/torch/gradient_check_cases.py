@@ -197,7 +197,10 @@ class Case:
             yield self._control("wrenches", 0.1, self._normal(WORLDS, self.bodies, 6) * size)
         if hinges := len(self.model.drives.joints):
             yield self._control("torques", 1e-3, self._normal(WORLDS, hinges))
-            yield self._control("angles", 0.1, self._normal(WORLDS, hinges), self._tensor(self._driven_angles()))
+            driven = [joint.angle or 0.0 for joint in self.model.drives.joints]
+            yield replace(
+                self._control("angles", 0.1, self._normal(WORLDS, hinges), self._tensor(driven)), name="hinge angles"
+            )
         if not any(joint.first < 0 for joint in self.model.scene.body_joints):  # whose weight is a load
             yield self._control("gravity", 10.0, self._normal(WORLDS, 3) * self.down, gravity)
         if self.model.magnetic:
@@ -236,10 +239,6 @@ class Case:
         yield self._state("body orientations", 1.0, turned)
         yield self._state("body velocities", 1.0, lambda x: moved(x, 0))
         yield self._state("body angular velocities", 10.0, lambda x: moved(x, 1))
-
-    def _driven_angles(self) -> list[float]:
-        """Return the driven angles of hinges, zero without."""
-        return [joint.angle or 0.0 for joint in self.model.drives.joints]
 
     def _moved(self, array: str, blocks: str, shift: torch.Tensor) -> list:
         points = self.engine.layout.points(self.state.values, array, blocks)

@@ -9,7 +9,7 @@ from ddg_warp.scene.drag import Granular, QuadraticDrag
 from ddg_warp.scene.flow import Turbulence
 from ddg_warp.scene.grip import Grip
 from ddg_warp.scene.material import Circle, Ellipse, Material, Ribbon
-from ddg_warp.scene.obstacles import Plane, Sphere
+from ddg_warp.scene.obstacles import Box, Plane, Sphere
 from ddg_warp.scene.prescribed_motion import Motion
 from ddg_warp.scene.scene import Scene
 
@@ -167,6 +167,16 @@ def _fixed_on_ball(**friction) -> Callable:
     return hold
 
 
+def _on_box(scene: Scene, material: Material) -> None:
+    """Add a rod on a rigid box, which rubs a plane."""
+    scene.add_rod(CURVE, section=Circle(0.004), material=material)
+    scene.add_body(
+        Box((0.18, 0.05, -0.085), (0.05, 0.04, 0.03), radius=0.004), density=300.0, angular_velocity=(1.0, 2.0, 3.0)
+    )
+    scene.add_obstacle(Plane((0.0, 0.0, -0.135), (-0.03, 0.0, 1.0)))
+    scene.contact(law="barrier", range=0.02, stiffness=5.0, friction=0.3, velocity=0.5)
+
+
 def _over_plane(scene: Scene, shell: int) -> None:
     scene.add_obstacle(Plane((0.0, 0.0, -0.01), (-0.03, 0.0, 1.0)))
     _add_contact(scene, "barrier")
@@ -265,6 +275,7 @@ OBJECTS: dict[str, tuple[int, Callable]] = {
         3,
         _rod(section=Circle(0.004), hold=_fixed_on_ball(friction=0.3, velocity=0.01, rolling=True)),
     ),
+    "rod on a rigid box": (3, _on_box),
     "shell on a plane": (3, _sheet("midedge_dof", more=_over_plane)),
     "rod under a couple": (3, _rod(more=lambda s, r: s.add_couple(r, -1, (1e-4, 2e-4, -1e-4)))),
     "shell under pressure": (3, _sheet("midedge_dof", more=lambda s, k: s.add_pressure(k, 5.0))),
