@@ -74,7 +74,7 @@ def balance_kernel(real, linear, quadratic: bool, contact: bool):
     Meeting, Bodies = meeting_type(real, linear), bodies_type(real)
     Given, Found, H = inputs_type(real, quadratic), results_type(real, linear), wp.types.vector(3, linear)
     (outer, settle), add = residual_functions(real, linear, quadratic, contact), elements_function(real, linear)
-    largest, (_, transposed, *_) = largest_function(real), rotations(real)
+    largest, (rotated, transposed, *_) = largest_function(real), rotations(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def balance(
@@ -110,17 +110,19 @@ def balance_kernel(real, linear, quadratic: bool, contact: bool):
         moment_stiff += wp.max(wp.get_diag(K))
         pushed = V(bodies.force[body])
         turned = V(bodies.moment[body])
+        # the moment has no potential: its work is that about the mean rotation vector, to third order in u
+        work -= wp.dot(transposed(turn - u * real(0.5), turned), u)
         virial = M()
         if bodies.center[b] >= 0:
             center_arm = bodies.y[bodies.center[b] + carried]
             turned += wp.cross(center_arm, pushed)
             virial += wp.outer(pushed, center_arm)
+            work -= wp.dot(pushed, center_arm - rotated(turn - u, rotated(-turn, center_arm)))
         force += pushed
         size += largest(pushed)
         change -= wp.dot(pushed, inputs.q[center] - inputs.base[center])
         moment += transposed(turn, turned)
         moment_size += largest(turned)
-        work -= wp.dot(turned, u)
         for j in range(bodies.starts[b], bodies.starts[b + 1]):
             k_j = bodies.carried[j]
             i = k_j + offset
