@@ -362,6 +362,39 @@ def test_box_comes_to_rest_on_a_floor():
     assert abs(force) == pytest.approx(0.24 * GRAVITY, rel=1e-3)
 
 
+def tumbling(shape: str) -> tuple[ddg.Scene, int]:
+    """Return a scene of a body that rotates against a plane, and a number of steps."""
+    scene = ddg.Scene(gravity=(0, 0, -GRAVITY * (shape == "needle")))
+    if shape == "cube":
+        cube = ddg.Box((0, 0, 0.04), (0.01,) * 3, radius=1e-3)
+        scene.add_body(cube, density=1000.0, velocity=(0, 0, -0.1), angular_velocity=(0, 100.0, 0))
+    else:
+        axis = 0.01 * np.array([np.sin(0.9), -np.sin(0.2) * np.cos(0.9), np.cos(0.2) * np.cos(0.9)])
+        ends = ((0, 0, 0.0413) - axis, (0, 0, 0.0413) + axis)
+        shape = ddg.Capsule(*map(tuple, ends), 3e-4)
+        scene.add_body(shape, density=1000.0, angular_velocity=(40.0, 20.0, 10.0))
+    scene.add_obstacle(ddg.Plane())
+    scene.contact(friction=0.5 * bool(scene.gravity[2]))
+    return scene, 80 if scene.gravity[2] == 0 else 46
+
+
+@pytest.mark.parametrize("shape", ["cube", "needle"])
+def test_impacts_of_rotating_bodies_create_no_energy(shape):
+    """The energy after an impact is at most that before, in steps of half a radian: these are taken in halves where it is not.
+
+    Whole steps would add 18 % to the energy of the cube, and triple that of the needle.
+    """
+    scene, steps = tumbling(shape)
+    model, integrator, state = build(scene)
+    energies = [sum(model.energies(state).values())]
+    for _ in range(steps):
+        state = integrator.step(state, 5e-3)
+        energies.append(sum(model.energies(state).values()))
+    assert np.diff(energies).max() < 0.01 * energies[0]
+    assert energies[-1] < 0.95 * energies[0]
+    assert integrator.statistics()["outcomes"].get("energy_drift", 0) > 0
+
+
 @pytest.mark.parametrize("turn", [1 / 6, 1 / 2])
 @pytest.mark.parametrize("place", [0.05, 0.19, 0.198])
 def test_bar_turns_past_no_rod(turn, place):
@@ -433,7 +466,7 @@ def test_equilibria_of_bodies_on_rods():
 
 
 def test_column_with_a_rigid_head_buckles():
-    """A clamped column of length L under a weight at the distance a above its end buckles at k L tan(k L) = L / a, P = EI k^2."""
+    """A clamped column of length L under a weight at the distance a above the end buckles at k L tan(k L) = L / a, P = EI k^2."""
     arm, stiffness = 0.1, YOUNG * np.pi * RADIUS**4 / 4
     k = brentq(lambda x: x * np.tan(x) - LENGTH / arm, 1e-6, 0.5 * np.pi - 1e-9) / LENGTH
     critical = stiffness * k**2

@@ -96,8 +96,8 @@ class Contacts:
             law: contact potential, "barrier" or "penalty"; or a `Law` with one strain, the gap [m]. Its parameters "stiffness"
                 and "range" are the arguments below, the others one number each. It is repulsive, convex, and zero from the range on.
                 Surfaces never overlap if its energy is infinite at zero gap.
-            range: activation distance: gap below which contact acts [m]; by default half of the smallest radius of a rod or half
-                thickness of a shell.
+            range: activation distance: gap below which contact acts [m]. By default half of the smallest radius of a rod or half
+                thickness of a shell. For a rigid body at most a twentieth of the size.
             stiffness: of the contact potential [N/m]; between two objects the geometric mean. By default ten weights of a
                 node, bending to ten radii, or half a percent of membrane strain close the gap by a fraction of `range`. A step that
                 reaches the minimum gap, in substeps too, is retried with at least ten node masses over the square of its length,

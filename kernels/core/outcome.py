@@ -11,7 +11,9 @@ NON_FINITE = 5
 INDEFINITE = 6
 STEP_FAILED = 7  # An earlier step failed for good; the rod stays in its last good state.
 ROUNDING_DOMINATED = 8  # Instead of CONVERGED_TO_ROUNDING where rounding decides the motion, as allowed by the user.
-ENERGY_DRIFT = 9  # The midpoint rule would have exceeded the allowed energy drift; see `kernels.stepping.energy_drift`.
+# The midpoint rule would have exceeded the allowed energy drift; see `kernels.stepping.energy_drift`. Or contact of a rotating body
+# would have created energy; see `kernels.rigid_bodies.contact_energy`.
+ENERGY_DRIFT = 9
 INTERPENETRATION = 10  # Primitives would have crossed.
 MINIMUM_GAP = 11  # Minimum gap reached: the forces of the barrier, which grow without bound, have lost their digits.
 ROTATED_TOO_FAR = 12  # Supports or obstacles would rotate farther in a step than substeps resolve.

@@ -10,6 +10,7 @@ from ddg_warp.scene.contact import Contact, contact_names
 from ddg_warp.scene.obstacles import BALL, MESH
 
 HALF = 0.5  # default activation distance over the smallest radius
+BODY = 0.05  # largest default activation distance over the size of a rigid body
 
 # Default contact forces that close a fraction of the activation distance. WEIGHTS: nodal weights. BENDING: fraction of EI / r^2, that
 # is, bending to ten radii. STRAIN: strain of a membrane. LIMP: strain of a rod, decisive where bending stiffness is negligible.
@@ -119,8 +120,8 @@ def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: n
     """
     names, group = np.unique([body.name for body in bodies], return_inverse=True)
     count, moving = len(names), np.array([not body.still for body in bodies])
-    radius = min(body.radius for body in bodies if not body.still)
-    within = np.full((count, count), HALF * radius if law.range is None else law.range)
+    reach = min(_reach(scene, body) for body in bodies if not body.still)
+    within = np.full((count, count), reach if law.range is None else law.range)
     rough = np.full((count, count, 3), law.friction)
     force, inertia = (_of_both(values, group, moving) for values in (scale, INERTIA * mass))
     stiffness = np.full((count, count), np.nan if law.stiffness is None else law.stiffness)
@@ -154,6 +155,15 @@ def _numbers(scene, law: Contact, bodies: list[Body], scale: np.ndarray, mass: n
         ignored,
         roots,
     )
+
+
+def _reach(scene, body: Body) -> float:
+    """Return the default activation distance of a collision body [m]: half of the radius, less for a thick rigid body."""
+    if body.rigid < 0:
+        return HALF * body.radius
+    rigid = scene.bodies[body.rigid]
+    points = np.concatenate([shape.points for shape in rigid.shapes]) - rigid.center
+    return min(HALF * body.radius, BODY * float(np.linalg.norm(points, axis=1).max() + body.radius))
 
 
 def _refuse_ranges(scene, within: np.ndarray, names) -> None:

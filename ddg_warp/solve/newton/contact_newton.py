@@ -166,9 +166,11 @@ class NewtonContact:
         self.pending.arrive(iterates, system, islands, self.limit.modes)
 
     @timer("interpenetration check")
-    def finish(self, before: wp.array, iterates, islands) -> None:
-        """Refuse substeps with interpenetration."""
-        self.search.check_crossings(before, iterates.q)
+    def finish(self, before, iterates, islands) -> None:
+        """Refuse substeps from the coupled state `before` with interpenetration, or with energy created by rotating bodies."""
+        if self.rigid_bodies:
+            self.rigid_bodies.refuse(before, iterates, self.terms.forces, islands)
+        self.search.check_crossings(before.q, iterates.q)
         inputs = [self.search.crossed, self.terms.gap, self.search.counters.overflow, *islands.arrays]
         self._launch(self._refuse, inputs, [self.tally.crossed, self.tally.least])
         self.tally(islands.arrays[0])

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ddg_warp.kernels.rigid_bodies import condensation, motion
+from ddg_warp.kernels.rigid_bodies import condensation, contact_energy, motion
 from ddg_warp.solve.collision.support_arcs import PART
 from ddg_warp.timers import timer
 
@@ -49,7 +49,7 @@ class RigidBodies:
             wp.zeros(n, dtype=real, device=device) for n in (worlds * coupled.blocks, worlds)
         )
         self._measure, self._shorten, self._note = motion.arc_kernels(real)
-        self._turn = motion.turn_kernel(real)
+        self._turn, self._refuse = motion.turn_kernel(real), contact_energy.refuse_kernel(real)
         self._place, self._spread = motion.place_kernel(real), motion.spread_kernel(real, linear)
         self._balance = condensation.balance_kernel(real, linear, quadratic, outer)
         M = wp.types.matrix((3, 3), linear)
@@ -68,7 +68,7 @@ class RigidBodies:
     @property
     def matrix_kernels(self) -> list:
         """Kernels of carried nodes and of linear systems."""
-        contact = [self._gather, self._condense_diagonal, self._condense_product, self._turn]
+        contact = [self._gather, self._condense_diagonal, self._condense_product, self._turn, self._refuse]
         contact += [self._measure, self._shorten, self._note]
         return [
             self._place,
@@ -126,6 +126,13 @@ class RigidBodies:
         self._launch(self._measure, len(self.tables), inputs, [fractions, self.least])
         inputs = [start, *bodies, together, fractions, self.least]
         wp.launch(self._shorten, (worlds, self.coupled.blocks), inputs, [q], device=self.coupled.device)
+
+    def refuse(self, before, iterates, push: wp.array, islands) -> None:
+        """Reject substeps from a coupled state in which contact forces `push` (W N,) on rotating bodies create energy."""
+        tables = self.tables
+        inputs = [before.rotation, before.momentum, tables.moments, self.predicted, tables.arms, self.bodies]
+        inputs += [iterates.q, iterates.target, self.coupled.mass, push]
+        self._launch(self._refuse, len(tables), inputs, [*islands.arrays])
 
     def note_fractions(self, time: wp.array) -> None:
         """Limit step fractions (worlds,) to the fractions of `bound_rotations`."""

@@ -212,7 +212,7 @@ class StepDriver:
             contact.lag_again(solution, newton.iterates, self.islands)
             self.solve(start)
         if contact:
-            contact.finish(before.q, newton.iterates, self.islands)  # interpenetration check
+            contact.finish(before, newton.iterates, self.islands)  # interpenetration check
         if self.energy:
             self.energy.check_drift(before, start)
         with timer("finish"):  # positions, velocities and accelerations of accepted substeps
