@@ -10,8 +10,8 @@ energy created is
     C = 1/2 l_n+1 . o_n+1 - 1/2 l_n . o_n - h (t - sum y x f) . o_n+1 - sum f . (y - y_n) .
 
 It is compared with the dissipation of the translation, m |dv|^2 / 2. Substeps are taken in halves if a body rotates by more than
-`ARC`, and C exceeds that by more than a fraction of the energy of the rotation. Shorter arcs are resolved: there C also counts nodes that take over the
-load of others, as of a rolling polygon, which creates none.
+`ARC`, and C exceeds that by more than a fraction of the energy of the rotation. Shorter arcs are resolved: there C also counts nodes
+that take over the load of others, as of a rolling polygon, which creates none.
 """
 
 from functools import cache

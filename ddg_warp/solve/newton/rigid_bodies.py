@@ -128,7 +128,7 @@ class RigidBodies:
         wp.launch(self._shorten, (worlds, self.coupled.blocks), inputs, [q], device=self.coupled.device)
 
     def refuse(self, before, iterates, push: wp.array, islands) -> None:
-        """Reject substeps from a coupled state in which contact forces `push` (W N,) on rotating bodies create energy."""
+        """Reject substeps from a coupled state where contact forces `push` (W N,) on rotating bodies create energy."""
         tables = self.tables
         inputs = [before.rotation, before.momentum, tables.moments, self.predicted, tables.arms, self.bodies]
         inputs += [iterates.q, iterates.target, self.coupled.mass, push]
