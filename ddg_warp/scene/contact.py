@@ -31,7 +31,7 @@ class Contact:
     friction: float = 0.0
     friction_law: str = "logistic"
     velocity: float = 1e-3
-    friction_iterations: int = 1
+    friction_iterations: int | None = None
     rolling: bool = False
     exclusion_length: float | None = None
     radius: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
@@ -76,7 +76,7 @@ class Contacts:
         friction: float = 0.0,
         friction_law: str = "logistic",
         velocity: float = 1e-3,
-        friction_iterations: int = 1,
+        friction_iterations: int | None = None,
         rolling: bool = False,
         exclusion_length: float | None = None,
         radius: Mapping[str, float] | None = None,
@@ -105,7 +105,8 @@ class Contacts:
             friction: Coulomb coefficient; `contact_between` accepts one for each direction, too.
             friction_law: "logistic" or "polynomial" growth of friction with slip velocity.
             velocity: stick threshold nu [m/s], the slip velocity of nearly full friction; sticking contacts creep at less.
-            friction_iterations: friction lag: number of updates of normal forces and tangents in a step.
+            friction_iterations: friction lag: number of updates of normal forces and tangents in a step. By default 1, and 2 with
+                rigid bodies, whose impacts begin and end in a step.
             rolling: whether friction acts on the surface of rods, with its torque on the twist angle, so that rods roll. Otherwise it
                 acts between centrelines and loses angular momentum. Two free parallel rods that collide and slide across each
                 other lose all of it, but keep 0.95 with rolling. Friction along rods exerts no torque about the
@@ -141,7 +142,9 @@ class Contacts:
             _friction(f"{call}friction", friction, ONE),
             argument_checks.choice(f"{call}friction_law", friction_law, FRICTION_LAWS),
             argument_checks.positive(f"{call}velocity", velocity, "m/s"),
-            argument_checks.count(f"{call}friction_iterations", friction_iterations),
+            None
+            if friction_iterations is None
+            else argument_checks.count(f"{call}friction_iterations", friction_iterations),
             argument_checks.flag(f"{call}rolling", rolling),
             exclusion_length,
             MappingProxyType(dict(radius or {})),

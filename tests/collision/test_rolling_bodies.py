@@ -127,3 +127,46 @@ def test_grazing_balls_spin_each_other(device):
     rates = [state.body(name).angular_velocity for name in ("first", "second")]
     np.testing.assert_allclose(*rates, rtol=1e-9)
     np.testing.assert_array_equal(rates[0][0], rates[0][1])
+
+
+def walking(slope: float, legs: int, gyration2: float) -> tuple[float, float, float]:
+    """Return mean rate and rate after an impact of a rimless wheel (leg = g = 1), and the time of a leg's step.
+
+    The wheel falls over a foot as a pendulum. Plastic impacts about the new foot multiply its rate by
+    (k^2 + cos 2a) / (k^2 + 1), a = pi / legs, with the radius of gyration k.
+    """
+    a = np.pi / legs
+    kept = ((gyration2 + np.cos(2.0 * a)) / (gyration2 + 1.0)) ** 2
+    gained = 2.0 * (np.cos(slope - a) - np.cos(slope + a)) / (1.0 + gyration2)
+    square = kept * gained / (1.0 - kept)
+    angle = slope - a + 2.0 * a * (np.arange(4000) + 0.5) / 4000
+    rates = np.sqrt(square + 2.0 * (np.cos(slope - a) - np.cos(angle)) / (1.0 + gyration2))
+    time = 2.0 * a * np.mean(1.0 / rates)
+    return 2.0 * a / time, np.sqrt(square), time
+
+
+def test_rimless_wheel_walks_at_its_rate(device):
+    """A wheel of eight legs walks down a slope at the rate of plastic impacts, by steps of a 200th of a leg's step."""
+    slope, legs, gyration2, foot = np.radians(15.0), 8, 0.1, 1e-3
+    rate, start, time = walking(slope, legs, gyration2)
+    assert rate == pytest.approx(0.703393, rel=1e-5)
+    scene, half = ddg.Scene(gravity=(0.0, 0.0, -1.0)), np.pi / legs
+    normal, lean = np.array([np.sin(slope), 0.0, np.cos(slope)]), slope - half
+    up = np.array([np.sin(lean), 0.0, np.cos(lean)])
+    center = 1.3 * foot * normal + up
+    directions = lean + np.pi + 2.0 * half * np.arange(legs)
+    feet = [center + [np.sin(d), y, np.cos(d)] for d in directions for y in (-0.3, 0.3)]
+    inertia = gyration2 * np.array([5.0, 1.0, 5.0])
+    shapes = [ddg.Sphere(tuple(x), foot) for x in feet]
+    spin = np.array([0.0, start, 0.0])
+    motion = {"velocity": tuple(np.cross(spin, up)), "angular_velocity": tuple(spin)}
+    scene.add_body(shapes, mass=1.0, inertia=inertia, center=tuple(center), **motion)
+    scene.add_obstacle(ddg.Plane(normal=tuple(normal)))
+    scene.contact(friction=1.0)
+    integrator, state, angle, impacts = ddg.Integrator(model := scene.build(device)), model.state(), 0.0, []
+    while len(impacts) < 6:
+        state = integrator.step(state, time / 200)
+        angle += float(state.body(0).angular_velocity[1]) * time / 200
+        if angle > 2.0 * half * (len(impacts) + 1):
+            impacts.append(state.time)
+    assert 8.0 * half / (impacts[5] - impacts[1]) == pytest.approx(rate, rel=0.02)

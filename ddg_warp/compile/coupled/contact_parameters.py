@@ -1,5 +1,7 @@
 """Contact of the coupled system: collision bodies and parameters of pairs of groups."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from ddg_warp.compile.collision_bodies import ROD, Body, ContactParameters
@@ -26,6 +28,8 @@ def contact_parameters(scene, coupled: CoupledSystem) -> ContactParameters | Non
     law = scene.contact_settings
     if law is None:
         return None
+    iterations = law.friction_iterations or 1 + any(body.shapes for body in scene.bodies)
+    law = replace(law, friction_iterations=int(iterations))
     names, bodies, forces, sections = contact_names(scene), [], [], {}
     for rod in coupled.rods:
         batch = rod.piece.batch
