@@ -36,6 +36,7 @@ from ddg_warp.io.usd_check import validate
 from ddg_warp.io.usd_contact import ContactsPrim, ObstaclePrim
 from ddg_warp.io.usd_groom import Groom, open_groom
 from ddg_warp.io.usd_groom_layer import GroomLayer
+from ddg_warp.io.usd_physics import Physics, write_curves, write_scene, write_surface
 from ddg_warp.io.usd_prims import ColorBy, CurvesPrim, Frame, PointsPrim, SurfacePrim, TubesPrim
 from ddg_warp.io.usd_read import read_curves
 from ddg_warp.typing import Array, FilePath, Floats, Numbers
@@ -63,6 +64,7 @@ class CurvesWriter:
         obstacles: Obstacles, such as `model.obstacles`; moving obstacles are written once a world.
         contact_scales: Names and typical scales of contact, for frames with contacts.
         bodies: Rigid bodies, such as `model.rigid_bodies`, whose shapes are the last obstacles; without, these are moving obstacles.
+        physics: Materials by which curves and surfaces are deformable bodies, see `usd_physics`; not of tubes.
     """
 
     def __init__(
@@ -79,6 +81,7 @@ class CurvesWriter:
         obstacles: Obstacles | None = None,
         contact_scales: ContactScales | None = None,
         bodies: Bodies | None = None,
+        physics: Physics | None = None,
     ):
         argument_checks.positive("CurvesWriter: fps", fps, "1/s")
         self.path = Path(path)
@@ -103,9 +106,11 @@ class CurvesWriter:
                 )
         if len(shapes.curves.counts):
             kind = TubesPrim if tube else CurvesPrim
-            self._prims += _define_rods(self._stage, shapes, colors, color_by, kind, kept, numbers)
+            self._prims += _define_rods(self._stage, shapes, colors, color_by, kind, kept, numbers, physics)
         if shapes.surfaces is not None:
-            self._prims += _define_surfaces(self._stage, shapes, color_by, numbers)
+            self._prims += _define_surfaces(self._stage, shapes, color_by, numbers, physics)
+        if physics is not None:
+            write_scene(self._stage, physics.gravity)
         alone = 0 if obstacles is None else len(obstacles) - (0 if bodies is None else int(bodies.shapes.sum()))
         for k in range(alone):
             for world in range(shapes.worlds if obstacles.moved[k] else 1):
@@ -260,7 +265,14 @@ def _drawable(curves) -> Shapes:
 
 
 def _define_rods(
-    stage: Usd.Stage, shapes: Shapes, colors, color_by, kind, attributes: Mapping, numbers: dict[str, int]
+    stage: Usd.Stage,
+    shapes: Shapes,
+    colors,
+    color_by,
+    kind,
+    attributes: Mapping,
+    numbers: dict[str, int],
+    physics: Physics | None,
 ) -> list[PointsPrim]:
     """Define one prim for each batch; two for open and closed rods, because USD wraps all curves of a prim alike."""
     curves = shapes.curves
@@ -278,17 +290,26 @@ def _define_rods(
                 path = _free_path(stage, str(names[0]), numbers)
                 prims.append(kind(stage, path, part, shapes.rows[mine], color, color_by))
                 prims[-1].add_attributes({name: values[rods] for name, values in attributes.items()})
+                if physics is not None:
+                    of_a_world = shapes.curves_of_a_world.counts
+                    members = np.flatnonzero(rods[: len(of_a_world)])
+                    write_curves(stage.GetPrimAtPath(path), physics, of_a_world, members, shapes.worlds)
     return prims
 
 
-def _define_surfaces(stage: Usd.Stage, shapes: Shapes, color_by, numbers: dict[str, int]) -> list[PointsPrim]:
+def _define_surfaces(
+    stage: Usd.Stage, shapes: Shapes, color_by, numbers: dict[str, int], physics: Physics | None
+) -> list[PointsPrim]:
     """Define one prim for each surface, with colors after the rods' colors in the palette."""
     surfaces, batches = shapes.surfaces, len(np.unique(shapes.curves.batch))
     of_a_world = len(surfaces.names) // shapes.worlds
     prims = []
     for k, (part, name) in enumerate(zip(surfaces.parts(), surfaces.names, strict=True)):
         color = np.array(PALETTE[(batches + k % of_a_world) % len(PALETTE)])
-        prims.append(SurfacePrim(stage, _free_path(stage, str(name), numbers), surfaces, part, color, color_by))
+        path = _free_path(stage, str(name), numbers)
+        prims.append(SurfacePrim(stage, path, surfaces, part, color, color_by))
+        if physics is not None:
+            write_surface(stage.GetPrimAtPath(path), physics.shells[k % of_a_world])
     return prims
 
 

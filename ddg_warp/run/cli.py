@@ -103,6 +103,7 @@ def parser(arguments: list[str]) -> Parser:
     run.add_argument(
         "--fps", type=float, metavar="F", help="frames per second of scene.usdc (default: of recorded steps)"
     )
+    run.add_argument("--physics", action="store_true", help="write materials of deformable bodies to scene.usdc")
     run.add_argument("--json", type=Path, metavar="FILE", help="write the summary to FILE too")
     run.add_argument("--movie", type=Path, metavar="FILE", help="write a movie of the run to FILE.mp4 (extra `render`)")
     if arguments[:1] == ["run"] and len(arguments) > 1 and not arguments[1].startswith("-"):
@@ -243,6 +244,7 @@ def run_scene(chosen: argparse.Namespace) -> int:
                 fields=[name for name in (chosen.fields or "").split(",") if name],
                 every=chosen.every,
                 fps=chosen.fps,
+                physics=chosen.physics,
                 module=module,
                 provenance={"scene": name, "parameters": settings, "command": shlex.join(["ddg-warp", *sys.argv[1:]])},
                 **run_settings,

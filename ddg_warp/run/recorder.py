@@ -51,6 +51,7 @@ class Recorder:
         block: Number of frames written together.
         fps: Time codes per second of the scene; by default one time code a recorded frame, if the scene has a dt.
         tube: Whether the scene shows tubes instead of curves.
+        physics: Whether curves and shells of the scene are deformable bodies with materials, see `io.usd_physics`; not with tubes.
         time: Time of a frame: "state", the increasing time of states; or "frame", its number from 0 on, for a sequence of equilibria
             or designs. A resumed run keeps its choice.
         color_by: Field that colors surfaces of the scene, "strain", "curvature" or "energy" (see `quantities.triangle_fields`), and its
@@ -86,6 +87,7 @@ class Recorder:
         block: int = 64,
         fps: float | None = None,
         tube: bool = False,
+        physics: bool = False,
         time: str | None = None,
         color_by: tuple[str, float, float] | None = None,
         velocities: bool = False,
@@ -102,8 +104,11 @@ class Recorder:
         if not hasattr(model, "curves"):
             raise SceneError(f"Recorder: the model is {type(model).__name__}; give what scene.build() returns")
         every, block = argument_checks.count("Recorder: every", every), argument_checks.count("Recorder: block", block)
-        for name, value in {"usd": usd, "hdf5": hdf5, "tube": tube, "resume": resume, "force": force}.items():
+        flags = {"usd": usd, "hdf5": hdf5, "tube": tube, "physics": physics, "resume": resume, "force": force}
+        for name, value in flags.items():
             argument_checks.flag(f"Recorder: {name}", value)
+        if physics and tube:
+            raise SceneError("Recorder: physics needs curves, and tubes are meshes; leave out one of tube and physics")
         for name, value in {"velocities": velocities, "directors": directors, "contacts": contacts}.items():
             argument_checks.flag(f"Recorder: {name}", value)
         if counts is not None and not callable(counts):
@@ -149,7 +154,7 @@ class Recorder:
             if hdf5:
                 self._open_trajectory(resume, block, wanted, time)
             if usd:
-                self._open_scene(block, tube, wanted["attributes"])
+                self._open_scene(block, tube, wanted["attributes"], physics)
             if resume:
                 self._replay()
             elif force:
@@ -190,8 +195,9 @@ class Recorder:
         if wanted["attributes"] and not _same_attributes(wanted["attributes"], reader.attributes):
             raise ValueError(f"{reader.path} has other attributes: leave them out, or record the run again")
 
-    def _open_scene(self, block: int, tube: bool, attributes: Mapping) -> None:
+    def _open_scene(self, block: int, tube: bool, attributes: Mapping, physics: bool) -> None:
         from ddg_warp.io.usd import CurvesWriter
+        from ddg_warp.io.usd_physics import Physics
 
         model = self._model
         self._scene = CurvesWriter(
@@ -205,6 +211,7 @@ class Recorder:
             obstacles=model.obstacles,
             contact_scales=model.contact_scales if self._contacts else None,
             bodies=model.rigid_bodies,
+            physics=Physics.of(model.scene, len(model.curves.counts)) if physics else None,
         )
 
     def __enter__(self) -> Recorder:

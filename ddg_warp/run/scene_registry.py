@@ -15,7 +15,7 @@ from types import ModuleType
 
 RUN_SETTINGS = ("dt", "precision", "worlds")  # fixed in a resumed run, like the scene's parameters
 RENAMED = {"lags": "friction_iterations"}  # scene parameters of runs recorded by 0.1.0
-RESERVED = ("command", "scene", "device", "out", "resume", "json", "force", "fields", "every", "fps", "help")
+RESERVED = ("command", "scene", "device", "out", "resume", "json", "force", "fields", "every", "fps", "physics", "help")
 RESERVED += RUN_SETTINGS
 SHARED = ("dt", "duration")  # flags of `run` that a scene's build may take too, to fit its motions to them
 

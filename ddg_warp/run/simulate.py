@@ -199,6 +199,7 @@ def simulate(
     progress: bool = True,
     every: int | None = None,
     fps: float | None = None,
+    physics: bool = False,
 ) -> Result:
     """Run the analysis of a scene, as `ddg-warp run` does: record, check, and draw.
 
@@ -229,6 +230,7 @@ def simulate(
         every: Steps from one recorded state to the next, by default 1, or as in the resumed run; the number of steps is a multiple.
             `Result.times` has all steps, but of a resumed run the recorded ones.
         fps: Time codes per second of scene.usdc; by default one time code a recorded state.
+        physics: Whether rods and shells of scene.usdc are deformable bodies with materials; see `io.usd_physics`.
 
     Returns:
         The result, with `failure` if the run ended early.
@@ -247,7 +249,14 @@ def simulate(
         fields,
         every,
         fps,
-        flags={"force": force, "usd": usd, "progress": progress, "picture": picture, "wrenches": wrenches},
+        flags={
+            "force": force,
+            "usd": usd,
+            "physics": physics,
+            "progress": progress,
+            "picture": picture,
+            "wrenches": wrenches,
+        },
         functions={"observe": observe, "check": check, "clock": clock},
         mappings={"provenance": provenance, "options": options},
         paths={"out": out, "resume": resume},
@@ -328,7 +337,7 @@ def simulate(
             attributes |= {"duration": duration} if dynamic else {}
             attributes |= {"every": every} if every > 1 else {}
             keywords = {"provenance": attributes, "force": force, "fields": fields, "usd": usd, "counts": tallied}
-            keywords |= {"every": every, "fps": fps}
+            keywords |= {"every": every, "fps": fps, "physics": physics}
             recorder = stack.enter_context(open_recorder(model, out, resume, dt, **keywords))
         if resume is not None:
             for callback in scene.callbacks:  # restore parameters that depend on time

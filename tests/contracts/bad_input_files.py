@@ -34,6 +34,7 @@ refuse("recorder", {"a scene": (lambda: recorder(model=clamped()), "Recorder", "
 each("recorder", "every", [0, -1, 1.5, "second", None, True], lambda v: recorder(every=v), "every", "whole number")
 each("recorder", "block", [0, -1, 2.5, None], lambda v: recorder(block=v), "block", "whole number")
 each("recorder", "fps", [0.0, -24.0, NAN, "film"], lambda v: recorder(fps=v), "fps", "positive")
+each("recorder", "physics", [1, "yes", None], lambda v: recorder(physics=v), "physics", "True or False")
 each("recorder", "color_by", ["strain", 3, ("strain", 0.0)], lambda v: recorder(color_by=v), "color_by", "low end")
 each("recorder", "color_by", [("strain", 0.0, 1.0), ("hue", 0.0, 1.0)], lambda v: recorder(color_by=v), "color_by", "surfaces")
 each("recorder", "state", [None, 3, "now"], record, "record", "no state")
