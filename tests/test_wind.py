@@ -256,6 +256,7 @@ def test_wrench_of_a_fixed_plate(device, scheme):
         scene.hold(shell, np.arange(len(points)), name="frame")
         scene.drag(**LAWS["quadratic"])
         model = scene.build(device, precision, worlds=2)
+        assert "drag on 12 triangles of shells" in model.report()
         integrator, state = ddg.Integrator(model, scheme), model.state()
         integrator.watch_wrenches()
         state = integrator.step(state, 0.01)

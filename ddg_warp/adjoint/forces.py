@@ -157,10 +157,8 @@ class DragAdjoint:
         device = self.force.model.wp_device
         inputs = [ends, angles, part.count, *read]
         wp.launch(self._edges, self._shape, inputs, [*slots, by_coefficients, by_rate, start], device=device)
-        inputs, outputs = (
-            [starts, items, part.count, fixed, *slots, read[-1]],
-            [by_tangents, by_fixed, self._by_flow, start],
-        )
+        inputs = [starts, items, part.count, fixed, *slots, read[-1]]
+        outputs = [by_tangents, by_fixed, self._by_flow, start]
         wp.launch(self._gather, start.x.shape, inputs, outputs, device=device)
 
 
@@ -229,7 +227,10 @@ class CoupledDragAdjoint(DragAdjoint):
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        return [*super().kernels, *(self._shell_kernels if len(self._triangles) else ())]
+        of_rods = (
+            super().kernels if self.force.coefficients is not None else [*self._field_kernels, *self.force.kernels]
+        )
+        return [*of_rods, *(self._shell_kernels if len(self._triangles) else ())]
 
     def resist(self, before, tangents: wp.array, rate: float) -> None:
         """Write `inertia` of a solve from the state `before`, with the tangents of that solve."""

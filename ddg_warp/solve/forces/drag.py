@@ -155,10 +155,8 @@ class CoupledDrag(Drag):
         self._resist_shells = self.shell_coefficients = None
         if len(host.drag_triangles):
             self._resist_shells = shell_drag.resist_kernel(model.types.real, square, rods is None)
-            self._triangles, self.shell_coefficients = (
-                self._elements(host.drag_triangles, 3),
-                coupled.shell_coefficients,
-            )
+            self._triangles = self._elements(host.drag_triangles, 3)
+            self.shell_coefficients = coupled.shell_coefficients
 
     def _elements(self, places: np.ndarray, corners: int) -> list[wp.array]:
         """Return nodes of elements, the first `corners` of blocks (E, n), and elements by block, as offsets and items."""

@@ -1,5 +1,7 @@
 """Velocity of the fluid at the nodes of a rod group or of the coupled system; see `scene.flow`."""
 
+from weakref import WeakKeyDictionary
+
 import numpy as np
 import warp as wp
 
@@ -7,6 +9,10 @@ from ddg_warp import device_arrays
 from ddg_warp.kernels.adjoint import flow as adjoint_kernels
 from ddg_warp.kernels.forces import flow as kernels
 from ddg_warp.scene.flow import FlowGrid, Turbulence, depends_on_position, flow_at, is_on_host, terms_of
+
+_grids: WeakKeyDictionary = (
+    WeakKeyDictionary()
+)  # velocities of each `FlowGrid` by device and type, as they may be large
 
 
 class FlowVelocity:
@@ -27,14 +33,14 @@ class FlowVelocity:
         flow, real, device = model.scene.flow, model.types.real, model.wp_device
         vector, self._on_host = wp.types.vector(part.dim, real), is_on_host(flow)
         shape, terms = part.node_shape, terms_of(flow)
-        self._fields = (
-            [] if self._on_host else [_field(each, real, device) for each in terms if depends_on_position(each)]
-        )
+        local = [] if self._on_host else filter(depends_on_position, terms)
+        self._fields = [_field(each, real, device) for each in local]
         self._constant = [each for each in terms if not depends_on_position(each)]
         self._uniform = wp.zeros(1, dtype=vector, device=device)
         if self._on_host or self._fields:
             self.array = device_arrays.allocate(shape, vector, device)
             self._count = part.node_count
+            self._mask = np.arange(shape[0])[:, None] < self._count.numpy().reshape(part.worlds, -1)[0]
             self._lead, self._start = wp.zeros(1, dtype=real, device=device), kernels.start_kernel(part.dim, real)
             self._adders = [field.kernel(part.dim, real) for field in self._fields]
         else:
@@ -52,9 +58,8 @@ class FlowVelocity:
             return
         t = self._time(t0, t1)
         if self._fields or any(map(callable, self._constant)):
-            self._uniform.assign(
-                sum((self._at(t, flow=each) for each in self._constant), np.zeros(self._part.dim))[None]
-            )
+            uniform = sum((self._at(t, flow=each) for each in self._constant), np.zeros(self._part.dim))
+            self._uniform.assign(uniform[None])
         for field in self._fields:
             field.upload(t)
             self._lead.fill_(0.5 * (t1 - t0) if self.midpoint else 0.0)
@@ -93,8 +98,7 @@ class FlowVelocity:
             return
         x, v = (device_arrays.download(array).astype(float) for array in self._nodes(state))
         x = x + 0.5 * (t1 - t0) * v if self.midpoint else x
-        worlds, dim = self._part.worlds, self._part.dim
-        mask = np.arange(len(x))[:, None] < self._count.numpy().reshape(worlds, -1)[0]
+        worlds, dim, mask = self._part.worlds, self._part.dim, self._mask
         points = np.zeros((worlds, mask.sum(), 3))
         points[..., self._axes] = x.reshape(len(x), worlds, -1, dim).transpose(1, 0, 2, 3)[:, mask]
         values = np.zeros((worlds, *mask.shape, dim))
@@ -151,10 +155,12 @@ class _Grid:
 
     def __init__(self, flow: FlowGrid, real, device):
         self._flow, vector = flow, wp.types.vector(3, real)
-        velocities = flow.velocities if flow.times is not None else flow.velocities[None]
-        box = np.stack([flow.lower, flow.cells_per_length])
-        self.arrays = [wp.array(values, dtype=vector, device=device) for values in (velocities, box)]
-        self.arrays.append(wp.zeros(1, dtype=real, device=device))
+        kept, key = _grids.setdefault(flow, {}), (str(device), real)
+        if key not in kept:
+            velocities = flow.velocities if flow.times is not None else flow.velocities[None]
+            kept[key] = wp.array(velocities, dtype=vector, device=device)
+        box = wp.array(np.stack([flow.lower, flow.cells_per_length]), dtype=vector, device=device)
+        self.arrays = [kept[key], box, wp.zeros(1, dtype=real, device=device)]
 
     def upload(self, t: float) -> None:
         """Upload the index of t among the times."""
