@@ -151,6 +151,19 @@ def joined_in_fluid() -> ddg.Scene:
     return rods_in_fluid(True)
 
 
+def wind() -> ddg.Scene:
+    """Return a sheet stiffened by a rod, and a rod alone, in turbulence and quadratic drag."""
+    scene = ddg.Scene(flow=ddg.Turbulence((2.0, 0.5, 0.0), 0.3, 0.3, modes=32))
+    points, triangles = meshes.rectangle(4, 3, (0.4, 0.3))
+    shell = scene.add_shell(points, triangles, thickness=2e-3, material=SOFT, bending="hinge")
+    scene.hold(shell, np.flatnonzero(points[:, 0] <= 0.0))
+    rod = scene.add_rod(points[:5], section=SECTION, material=SOFT)
+    scene.attach(rod, range(5), shell, range(5))
+    scene.clamp(scene.add_rod(line(9) + [0.0, 1.0, 0.0], section=SECTION, material=SOFT))
+    scene.drag(law=ddg.QuadraticDrag(1.2, radius=0.05))
+    return scene
+
+
 def strands(scene: ddg.Scene, joined: bool = False) -> ddg.Scene:
     """Add curly hair, whose axial forces are unknowns in mixed precision; `joined`: with its roots joined to clamped stubs."""
     kind = {"section": ddg.Circle(40e-6), "material": HAIR}
@@ -196,6 +209,8 @@ CASES: dict[str, tuple[Callable[[], ddg.Scene], str, float, dict]] = {
     "drag_midpoint": (rods_in_fluid, "float64", 0.002, {"scheme": "implicit_midpoint"}),
     "drag_joined": (joined_in_fluid, "float64", 0.01, {}),
     "drag_joined_midpoint": (joined_in_fluid, "float64", 0.002, {"scheme": "implicit_midpoint"}),
+    "wind": (wind, "float64", 0.01, {}),
+    "wind_midpoint": (wind, "mixed", 0.005, {"scheme": "implicit_midpoint"}),
     "tensions": (tensions, "mixed", 1.0 / 60.0, {}),
     "tensions_joined": (tensions_joined, "mixed", 1.0 / 60.0, {}),
 }
@@ -211,6 +226,7 @@ GRADIENTS = {
     "grad_shell": ("shell, midedge", "implicit_euler"),
     "grad_drag": ("rod with drag", "implicit_midpoint"),
     "grad_drag_joined": ("joined rods with drag", "implicit_euler"),
+    "grad_wind": ("shell in turbulence", "implicit_midpoint"),
     "grad_couple": ("rod under a couple", "implicit_euler"),
     "grad_contact": ("rods in contact", "implicit_euler"),
     "grad_static": ("rod", "statics"),

@@ -199,6 +199,27 @@ FAULTS = (
         ("tests/test_drag.py",),
     ),
     Fault(
+        "quadratic drag: half of the derivative along the normal",
+        "kernels/forces/drag.py",
+        "wp.outer(t, t) * (real(2.0) * wp.abs(wp.dot(v, t)))",
+        "wp.outer(t, t) * wp.abs(wp.dot(v, t))",
+        ("tests/test_wind.py",),
+    ),
+    Fault(
+        "field of flow: taken where nodes start by the midpoint rule, too",
+        "kernels/forces/flow.py",
+        "velocity(lift(x[k, r] + v[k, r] * lead[0]), modes, phases)",
+        "velocity(lift(x[k, r]), modes, phases)",
+        ("tests/test_wind.py",),
+    ),
+    Fault(
+        "drag of shells: gradient by the first corner of a triangle",
+        "kernels/adjoint/shell_drag.py",
+        "position_out[0, t, island] = -by_a - by_b",
+        "position_out[0, t, island] = -by_a",
+        ("tests/adjoint/test_adjoint.py",),
+    ),
+    Fault(
         "gyroscopic couple: sign at one node",
         "kernels/forces/gyroscopic.py",
         "vb + wp.cw_mul(inverse_b, push)",
