@@ -96,4 +96,4 @@ def test_texts_of_the_mutation_check_occur_once():
     for fault in mutants.FAULTS:
         fault.check(ROOT)
         assert fault.new != fault.old
-    assert len({fault.name for fault in mutants.FAULTS}) == len(mutants.FAULTS) == 32
+    assert len({fault.name for fault in mutants.FAULTS}) == len(mutants.FAULTS) == 35
