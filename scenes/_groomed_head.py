@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ddg_warp.geometry import meshes
+from ddg_warp.typing import FilePath
 
 CURVES, HEAD, LOOK = "/char/hair/scalp_long", "/char/head", "/char/looks/hair"
 RATE, FIRST = 24.0, 1  # frames per second, first time code
@@ -56,7 +57,7 @@ def head(frame: int, points: np.ndarray) -> np.ndarray:
     return moved @ np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]]) + [SWAY * np.sin(phase), 0.0, 0.0]
 
 
-def write(path: Path, count: int = 400, frames: int = 49, subdivisions: int = 3) -> None:
+def write(path: FilePath, count: int = 400, frames: int = 49, subdivisions: int = 3) -> None:
     """Write the stage with `count` strands and `frames` time samples of the head."""
     from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 

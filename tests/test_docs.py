@@ -18,7 +18,7 @@ DOCS = ROOT / "tools" / "docs"
 TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))
 PAGES = [ROOT / "README.md", *(path for path in sorted(DOCS.rglob("*.md")) if path not in TUTORIALS)]
 BLOCK = re.compile(r"^```python(?: file=(\S+))?\n(.*?)^```", re.M | re.S)
-COMMAND = re.compile(r"^    (ddg-warp (?:run|sweep|bench|check|gradients|export|info|list).*?)(?: *#.*)?$", re.M)
+COMMAND = re.compile(r"^    (ddg-warp (?:run|sweep|groom|bench|check|gradients|export|info|list).*?)(?: *#.*)?$", re.M)
 FILES = {file: text for page in [*PAGES, *TUTORIALS] for file, text in BLOCK.findall(page.read_text()) if file}
 GOALS = {"arch": 15, "cable": 25, "gridshell": 18, "ring": 20}  # lines of code of tutorials
 LONG = ("strands", "bench")

@@ -31,6 +31,7 @@ SMALL = {
     "flying_beam": {"n": 20},
     "greenhill": {"n": 100},
     "growing_strip": {},
+    "groom_on_head": {"strands": 8, "frames": 3},
     "gridshell_dome": {"rods": 3},
     "hair": {"strands": 16},
     "hair_combed": {"gaps": 2, "rows": 2, "n": 24},

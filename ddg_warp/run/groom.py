@@ -28,7 +28,9 @@ SKIN = "skin"
 RANGE = 5.0  # activation distance of contact with the skin over the largest radius
 WEIGHTS = 3.0  # stiffness of contact with the skin times its range, in weights of the heaviest strand
 GRAVITY = 9.81  # m/s^2
-Value: TypeAlias = "float | str | Mapping[object, float | str]"  # a number, a primvar, or either by group
+Value: TypeAlias = (
+    "float | str | Mapping[int, float | str] | Mapping[str, float | str]"  # a number, a primvar, or either by group
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +68,7 @@ class GroomRun:
     state: State
     path: Path
     error: float
-    statistics: dict
+    statistics: dict[str, object]
 
 
 def groom_scene(
