@@ -1,5 +1,10 @@
 """Grooms: all kinds of USD curves, and the road from an artist's stage through the simulation to a layer over it."""
 
+import importlib.util
+import json
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
@@ -85,6 +90,39 @@ def test_roots_follow_the_head(run):
     np.testing.assert_allclose(result.state.points()[result.built.nodes][first], placed, atol=1e-12)
     outcomes = result.statistics["outcomes"]
     assert sum(count for name, count in outcomes.items() if name.startswith("converged")) > 0.9 * sum(outcomes.values())
+
+
+BLENDER = """
+import json, sys
+import bpy
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.ops.wm.usd_import(filepath=sys.argv[1], set_frame_range=True)
+scene = bpy.context.scene
+scene.frame_set(scene.frame_end)
+(item,) = (each for each in bpy.data.objects if each.type == "CURVES")
+item = item.evaluated_get(bpy.context.evaluated_depsgraph_get())
+points = [list(item.matrix_world @ point.vector) for point in item.data.position_data]
+names = [each.name for each in item.data.attributes]
+counts = [len(each.points) for each in item.data.curves]
+values = [scene.render.fps / scene.render.fps_base, scene.frame_start, scene.frame_end, counts, names, points]
+print("RESULT", json.dumps(values))
+"""
+
+
+# Blender (package bpy, with USD libraries of its own, so in its own process): frames, speed, counts, primvars, and vertices in metres.
+@pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="needs bpy, Blender as a module")
+def test_blender_plays_the_layer(run):
+    _, result = run
+    done = subprocess.run(
+        [sys.executable, "-c", BLENDER, str(result.path)], capture_output=True, text=True, check=True, timeout=120
+    )
+    rate, first, last, counts, names, points = json.loads(done.stdout.rpartition("RESULT ")[2].splitlines()[0])
+    groom = result.groom
+    assert (rate, first, last) == (groom.rate, groom.start, groom.end)
+    assert counts == groom.prims[0].counts.tolist()
+    assert {"clump_id", "st", "velocity", "radius"} <= set(names)
+    again = reopened(result.path, "vertices", groom.end)
+    np.testing.assert_allclose(points, again.points, atol=1e-6)
 
 
 def test_one_command_does_all(tmp_path, capsys):
