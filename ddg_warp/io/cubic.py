@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 
 BASES = {
     "bezier": np.array([[1, 0, 0, 0], [-3, 3, 0, 0], [3, -6, 3, 0], [-1, 3, -3, 1]], float),
@@ -41,6 +42,11 @@ class Sampled:
     def blend(self, values: np.ndarray) -> np.ndarray:
         """Return values at the points, shape (P, ...), from values at the vertices."""
         return np.einsum("pk,pk...->p...", self.weights, values[self.vertices])
+
+    def matrix(self) -> sparse.csc_matrix:
+        """Return the weights as a matrix from vertices to points (P, V)."""
+        rows = np.repeat(np.arange(len(self.weights)), self.weights.shape[1])
+        return sparse.csc_matrix((self.weights.ravel(), (rows, self.vertices.ravel())))
 
     def parameters(self) -> np.ndarray:
         """Return the parameter of each point, the number of knots before it on its curve, shape (P,)."""

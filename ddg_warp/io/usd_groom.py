@@ -8,7 +8,7 @@ Linear curves have their vertices as nodes. Instances of the scene graph are exp
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -330,6 +330,9 @@ class _Reader:
 
     def __init__(self, path: Path, code: float, samples: str | int, unread: list[str]):
         self._path, self._code, self._samples, self._unread = path, Usd.TimeCode(code), samples, unread
+        self._fine = FINER * (
+            cubic.BEZIER_STEP if isinstance(samples, str) else samples
+        )  # points of a segment, for errors
 
     def read(self, curves: UsdGeom.BasisCurves) -> tuple:
         """Return (prim, nodes [m], radius or None, error [m])."""
@@ -364,12 +367,12 @@ class _Reader:
         to_world, scale = placement(curves, self._code, where, CurveError)
         placed = vertices[prim.read] @ to_world[:3, :3] + to_world[3, :3]
         points = sampled.blend(placed)
-        prim.primvars.update(self._primvars(curves, prim))
-        object.__setattr__(prim, "widths", self._widths(curves, prim, where))
+        prim = replace(prim, primvars=self._primvars(curves, prim))
+        prim = replace(prim, widths=self._widths(curves, prim, where))
         radius = None if prim.widths is None else self._radius(prim, 0.5 * scale, where)
         checked_curves(points, sampled.counts, prim.closed, radius, name, str(self._path))
         self._list_rest(curves, name)
-        return prim, points, radius, self._errors(kind, basis, wrap, counts[kept], placed, sampled, points)
+        return prim, points, radius, self._errors(kind, basis, wrap, counts[kept], placed)
 
     def _say(self, name: str, text: str) -> None:
         self._unread.append(f"{name}: {text}")
@@ -397,22 +400,21 @@ class _Reader:
             return cubic.polygons(basis, wrap, counts)
         return cubic.sampled(basis, wrap, counts, None if isinstance(self._samples, str) else self._samples)
 
-    def _errors(self, kind, basis, wrap, counts, vertices, sampled: cubic.Sampled, points) -> np.ndarray:
+    def _errors(self, kind: str, basis: str, wrap: str, counts: np.ndarray, vertices: np.ndarray) -> np.ndarray:
         """Return upper bounds of distances between curves and polylines (R,) [m], at equal parameters of both."""
+        result, first = np.zeros(len(counts)), np.cumsum(counts) - counts
         if kind == UsdGeom.Tokens.linear:
-            return np.zeros(len(counts))
-        finer = cubic.sampled(basis, wrap, counts, FINER * (3 if isinstance(self._samples, str) else self._samples))
-        fine, result = finer.blend(vertices), np.empty(len(counts))
-        fine_along, along = finer.parameters(), sampled.parameters()
-        ends, fine_ends = (np.cumsum(each.counts) for each in (sampled, finer))
-        for strand, (end, fine_end) in enumerate(zip(ends, fine_ends, strict=True)):
-            mine = slice(end - sampled.counts[strand], end)
-            finely = slice(fine_end - finer.counts[strand], fine_end)
-            t, x = along[mine], points[mine]
+            return result
+        for count in np.unique(counts):
+            one, rows = np.array([count]), np.flatnonzero(counts == count)
+            nodes, fine = self._sampled(kind, basis, wrap, one), cubic.sampled(basis, wrap, one, self._fine)
+            along, corners = nodes.parameters(), np.eye(len(nodes.shares))
             if wrap == UsdGeom.Tokens.periodic:
-                t, x = np.append(t, sampled.knot_counts[strand]), np.concatenate([x, x[:1]])
-            chord = np.stack([np.interp(fine_along[finely], t, column) for column in x.T], 1)
-            result[strand] = np.sqrt(np.square(fine[finely] - chord).sum(1).max())
+                along, corners = np.append(along, nodes.knot_counts[0]), np.concatenate([corners, corners[:1]])
+            chords = np.stack([np.interp(fine.parameters(), along, corner) for corner in corners.T], 1)
+            off = fine.matrix().toarray() - chords @ nodes.matrix().toarray()
+            mine = vertices[first[rows][:, None] + np.arange(count)]
+            result[rows] = np.sqrt(np.square(off @ mine).sum(2).max(1))
         return result
 
     def _primvars(self, curves: UsdGeom.BasisCurves, prim: GroomPrim) -> dict[str, Primvar]:

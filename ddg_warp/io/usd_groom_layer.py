@@ -185,10 +185,7 @@ def _vertex_finder(groom: Groom, prim: GroomPrim):
         )
     if sampled.weights.shape[1] == 1:
         return lambda nodes: nodes
-    rows = np.repeat(np.arange(len(sampled.weights)), sampled.weights.shape[1])
-    matrix = sparse.csc_matrix(
-        (sampled.weights.ravel(), (rows, sampled.vertices.ravel())), shape=(len(sampled.weights), counts.sum())
-    )
+    matrix = sampled.matrix()
     if (sampled.counts == counts).all():
         return splu(matrix).solve
     normal = splu(sparse.csc_matrix(matrix.T @ matrix))

@@ -347,7 +347,7 @@ def _clear_lengths(groom: Groom, skin: AnimatedMesh, least: Floats) -> Floats:
         groom, skin: the strands and the surface.
         least: height of a clear node above the skin (P,) [m].
     """
-    triangle, weights = nearest_on_triangles(skin.rest, skin.triangles, groom.points)
+    triangle, weights = nearest_on_triangles(skin.rest, skin.triangles, groom.points, 2.0 * float(least.max()))
     a, b, c = np.moveaxis(skin.rest[skin.triangles[triangle]], 1, 0)
     away = groom.points - (weights[:, :1] * a + weights[:, 1:2] * b + weights[:, 2:] * c)
     outward = (away * np.cross(b - a, c - a)).sum(1)

@@ -13,6 +13,7 @@ from ddg_warp.scene.prescribed_motion import Motion
 from ddg_warp.typing import Floats, Integers, Numbers
 
 NEAREST = 16  # triangles by centroid among which the nearest one is sought first
+CHUNK = 2**14  # queries at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,8 +118,12 @@ class SurfaceFrames:
         return base + np.einsum("nij,nj->ni", rotation, self._offset) - self._roots, rotation
 
 
-def nearest_on_triangles(points: Floats, triangles: Integers, queries: Floats) -> tuple[Integers, Floats]:
+def nearest_on_triangles(
+    points: Floats, triangles: Integers, queries: Floats, within: float = np.inf
+) -> tuple[Integers, Floats]:
     """Return the triangle nearest to each query (n, 3), (n,), and barycentric weights of the nearest point (n, 3).
+
+    Farther than `within` [m] it is the nearest of a few triangles by centroid.
 
     Source: C. Ericson, Real-Time Collision Detection, 2005, section 5.1.5.
     """
@@ -128,12 +133,14 @@ def nearest_on_triangles(points: Floats, triangles: Integers, queries: Floats) -
     centroids = corners.mean(1)
     reach = np.linalg.norm(corners - centroids[:, None], axis=2).max()
     tree, count = cKDTree(centroids), min(NEAREST, len(triangles))
-    away, near = (each.reshape(len(queries), count) for each in tree.query(queries, count))
-    index, weights, distance = _nearest_of(corners, near, queries)
-    unsure = np.flatnonzero((away[:, -1] - reach < distance) & (count < len(triangles)))
-    for k in unsure:
-        candidates = np.array(tree.query_ball_point(queries[k], distance[k] + reach))
-        index[k : k + 1], weights[k : k + 1], _ = _nearest_of(corners, candidates[None], queries[k : k + 1])
+    index, weights = np.empty(len(queries), int), np.empty((len(queries), 3))
+    for rows in np.array_split(np.arange(len(queries)), max(1, -(-len(queries) // CHUNK))):
+        away, near = (each.reshape(len(rows), count) for each in tree.query(queries[rows], count))
+        index[rows], weights[rows], distance = _nearest_of(corners, near, queries[rows])
+        unsure = (away[:, -1] - reach < distance) & (distance < within) & (count < len(triangles))
+        for k, least in zip(rows[unsure], distance[unsure], strict=True):
+            candidates = np.array(tree.query_ball_point(queries[k], least + reach))
+            index[k : k + 1], weights[k : k + 1], _ = _nearest_of(corners, candidates[None], queries[k : k + 1])
     return index, weights
 
 
