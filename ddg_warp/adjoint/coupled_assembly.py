@@ -126,7 +126,7 @@ class CoupledAssembly:
         frame: wp.array,
         by_data: list[wp.array],
     ) -> None:
-        """Reverse `CoupledModel.turn_ghosts`: from own lagged rows of `start` to those of `before`, overwritten in `own_rows`.
+        """Reverse `CoupledModel.turn_ghosts`: from own lagged rows of `start` to own lagged rows of `before`, overwritten.
 
         Gradients by the rotation vectors in the blocks q, by frames and by constant data are accumulated.
         """

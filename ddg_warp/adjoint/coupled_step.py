@@ -15,7 +15,7 @@ from ddg_warp.adjoint.coupled_assembly import CoupledAssembly
 from ddg_warp.adjoint.coupled_linear_solve import CoupledLinearSolve
 from ddg_warp.adjoint.coupled_predictor import CoupledPredictor
 from ddg_warp.adjoint.forces import ForceCotangents, force_adjoints, quadratic_of
-from ddg_warp.adjoint.rigid_bodies import CORRECTIONS, RigidBodyAdjoint, refuse
+from ddg_warp.adjoint.rigid_bodies import RigidBodyAdjoint, refuse
 from ddg_warp.adjoint.supports import Supports
 from ddg_warp.adjoint.user_force import UserForceAdjoint
 from ddg_warp.kernels.adjoint import coupled_step, elements, time_step
@@ -62,9 +62,10 @@ class CoupledInputs:
         coefficients: by coefficients of edges (rows, W edges), by name of the force.
         rate, damping, gravity: by the quantities common to all blocks, one entry per block (W N,).
         elements_rate: by the rate, of every set (W E,), of forces on edges, of user-defined forces (W N,) and of friction.
-        user_forces: by the parameters of each user-defined force (worlds, nodes) of all components.
+        user_forces: by the parameters of each user-defined force (worlds, nodes), all components.
         contact_parameters, radius: by the parameters of contact, see `ContactAdjoint`; None without contact.
-        moments, force, moment: by the principal moments of inertia of rigid bodies, and by their controls (W B,); None without.
+        moments: by the principal moments of inertia of rigid bodies (W B,), or None.
+        force, moment: by the controls of rigid bodies (W B,), or None.
     """
 
     parameters: list[wp.array]
@@ -252,7 +253,7 @@ class CoupledStepAdjoint:
             struct = step.newton.rigid_bodies.bodies
             bodies = {
                 "virial": wp.clone(struct.virial),
-                "moment": wp.clone(struct.moment) if step.bodies.pushed else None,
+                "moment": wp.clone(struct.moment) if step.bodies.has_wrenches else None,
             }
         return CoupledSavedStep(
             before, solved, wp.clone(islands.substep_fraction), wp.clone(islands.retries), lagged=lagged, **bodies
@@ -387,8 +388,8 @@ class CoupledStepAdjoint:
     ) -> None:
         """Write w with rigid bodies, carried nodes included."""
         self.solve(solved, rate, kept.time, self.bodies.condense(grad_q), w, factors)
-        for _ in range(CORRECTIONS if kept.moment is not None else 0):
-            self.solve.system.solve_again(self.bodies.correct(grad_q, solved, w), w)
+        if kept.moment is not None:
+            self.bodies.solve(self.solve.system, grad_q, solved, w)
         self.bodies.spread(w)
 
     def has_overflow(self, q: wp.array) -> bool:

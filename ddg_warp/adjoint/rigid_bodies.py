@@ -10,7 +10,9 @@ from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.rigid_bodies import motion
 from ddg_warp.model.coupled_model import CoupledState
 
-CORRECTIONS = 6  # solves after the first with moments of controls; each reduces the error by half the rotation [rad] that these cause
+# Solves after the first with moments of controls. Each reduces the error by about half the rotation [rad] that these cause in a step.
+CORRECTIONS = 8
+CHANGED = 1e-6  # largest relative change by the last of them
 ADDED = "predicted", "momentum", "moments", "rate"  # gradients that kernels add to
 
 
@@ -19,23 +21,23 @@ class RigidBodyAdjoint:
 
     Args:
         bodies: `RigidBodies` of the exact matrix.
-        shares: `CoupledAssembly`.
+        assembly: `CoupledAssembly`.
         by_damping: gradient by the mass-proportional damping (W N,), added to.
 
     Attributes:
         gradients: gradients by the inputs of the bodies, a struct of kernels.
     """
 
-    def __init__(self, model, bodies, shares, by_damping: wp.array):
+    def __init__(self, model, bodies, assembly, by_damping: wp.array):
         coupled, real = model.coupled, model.types.real
-        self.coupled, self.bodies, self.tables, self._shares = coupled, bodies, coupled.bodies, shares
+        self.coupled, self.bodies, self.tables, self._assembly = coupled, bodies, coupled.bodies, assembly
         count, blocks = coupled.worlds * len(self.tables), coupled.worlds * coupled.blocks
 
         def make(size, dtype=coupled.vector):
             return wp.zeros(size, dtype=dtype, device=coupled.device)
 
         self._islands = Islands(coupled.worlds, real, coupled.device)
-        self._turned, self._by_turn, self._rhs, self._q, self._v = (make(blocks) for _ in range(5))
+        self._turned, self._by_turn, self._rhs, self._last, self._q, self._v = (make(blocks) for _ in range(6))
         self._lag = coupled.lagged()[1]
         self.gradients = gradients = kernels.gradients_type(real)()
         for name in ("predicted", "momentum", "moments", "force", "moment"):
@@ -44,16 +46,16 @@ class RigidBodyAdjoint:
         self._predict, self._turn = motion.predict_kernel(real, False), motion.turn_kernel(real)
         self._spread = motion.spread_kernel(real, real)
         self._end, self._flight = kernels.end_kernel(real), kernels.flight_kernel(real)
-        self._condense, _, self._correct, self._pull = kernels.solve_kernels(real, bodies.linear)
+        self._condense, _, self._correct, self._settle, self._pull = kernels.solve_kernels(real, bodies.linear)
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        own = [self._predict, self._turn, self._spread, self._end, self._flight]
-        return [*own, self._condense, self._correct, self._pull, *self.coupled.carries]
+        around = [self._predict, self._turn, self._spread, self._end, self._flight]
+        return [*around, self._condense, self._correct, self._settle, self._pull, *self.coupled.carries]
 
     def begin(self, kept, solved: CoupledState, rate: float, coefficient: float) -> CoupledState:
-        """Place bodies and carried nodes at the solution of a step; return it with the ghosts of its solve.
+        """Move bodies and carried nodes to the solution of a step; return it with the ghosts of its solve.
 
         Args:
             kept: `CoupledSavedStep`; solved: its solution.
@@ -70,8 +72,8 @@ class RigidBodyAdjoint:
         self._launch(self._predict, inputs, [self.bodies.predicted, struct.inertia])
         self.bodies.place(solved, islands)
         lag = [
-            own if part.term.measure.spins else rows
-            for part, own, rows in zip(self.coupled.sets, self._lag, solved.lag, strict=True)
+            turned if part.term.measure.spins else rows
+            for part, turned, rows in zip(self.coupled.sets, self._lag, solved.lag, strict=True)
         ]
         solved = replace(solved, lag=lag)
         self._find_turn(before)
@@ -123,11 +125,18 @@ class RigidBodyAdjoint:
         inputs += [self.coupled.blocks]
         wp.launch(self._spread, (self.coupled.worlds, count), inputs, [w], device=self.coupled.device)
 
-    def correct(self, grad_q: wp.array, solved: CoupledState, w: wp.array) -> wp.array:
-        """Return the right-hand side of the next solve with moments of controls, which have no potential."""
-        rhs = self.condense(grad_q)
-        self._launch(self._correct, [self.bodies.bodies, solved.q, w, self.coupled.blocks], [rhs])
-        return rhs
+    def solve(self, system, grad_q: wp.array, solved: CoupledState, w: wp.array) -> None:
+        """Correct a solution w of the adjoint system for moments of controls, which have no potential.
+
+        Marks worlds in `failed` of the `ExactSystem` where the corrections do not converge.
+        """
+        blocks, last = self.coupled.blocks, self._last
+        for _ in range(CORRECTIONS):
+            wp.copy(last, w)
+            rhs = self.condense(grad_q)
+            self._launch(self._correct, [self.bodies.bodies, solved.q, w, blocks], [rhs])
+            system.solve_again(rhs, w)
+        self._launch(self._settle, [self.tables.spins, last, w, blocks, CHANGED], [system.failed])
 
     def pull(self, solved: CoupledState, w: wp.array, grad_q: wp.array, step) -> None:
         """Add the gradients through the residual; move the gradients by carried nodes to the origins."""
@@ -135,7 +144,9 @@ class RigidBodyAdjoint:
         self._launch(self._pull, [*inputs, *step], [grad_q, self.gradients])
 
     def depart(self, before: CoupledState, solved: CoupledState, by_frame, own_rows, by_data, start, step) -> None:
-        """Reverse the flight with its ghosts, and write the gradients by orientations and angular momenta of the start.
+        """Reverse free flight.
+
+        Writes the gradients by orientations and angular momenta of the start.
 
         Args:
             by_frame, own_rows: gradients by frames, added to, and by own lagged rows, overwritten.
@@ -143,7 +154,7 @@ class RigidBodyAdjoint:
         """
         tables = self.tables
         self._by_turn.zero_()
-        self._shares.unturn(solved, before, self._turned, own_rows, self._by_turn, by_frame, by_data)
+        self._assembly.unturn(solved, before, self._turned, own_rows, self._by_turn, by_frame, by_data)
         inputs = [before.rotation, before.momentum, tables.moments, self.bodies.predicted, self._by_turn]
         inputs += [tables.spins, self.coupled.blocks, *step, self.gradients]
         self._launch(self._flight, inputs, [start.rotation, start.momentum])
@@ -153,10 +164,10 @@ class RigidBodyAdjoint:
 
 
 def refuse(model, scheme: str | None) -> None:
-    """Refuse gradients through rigid bodies where there are none.
+    """Refuse gradients through rigid bodies by scheme and scene.
 
     Raises:
-        SceneError: names the scheme or the object beside bodies.
+        SceneError: names the scheme, or the objects.
     """
     if not model.scene.bodies:
         return
@@ -165,7 +176,7 @@ def refuse(model, scheme: str | None) -> None:
     for refused, reason in (
         (scheme is None, "in equilibrium; gradients go through time steps by 'implicit_euler'"),
         (scheme == "implicit_midpoint", "by the implicit midpoint rule; use 'implicit_euler'"),
-        (host.followers, "beside follower loads; leave them out"),
+        (host.followers, "in a scene with follower loads; leave them out"),
         (
             contact is not None and contact.has_friction and contact.law.friction_iterations > 1,
             "with several friction iterations a step; set friction_iterations=1",

@@ -16,14 +16,14 @@ class JointDrives:
     Attributes:
         joints: the hinges, `BodyJoint`, in the order of `Controls.angles`.
         driven: mask of hinges with a driven angle, or with a spring (hinges,).
-        places: element sets with hinges, and the indices of the hinges in one of their parameters (worlds, hinges).
+        sets: element sets with hinges, and the indices of the hinges in one of their parameters (worlds, hinges).
         kept: True while the values in memory stay, whatever `to` is given.
     """
 
     def __init__(self, model):
         self.joints = [joint for joint in model.scene.body_joints if joint.call == "hinge"]
         self.driven = np.array([joint.angle is not None or joint.spring is not None for joint in self.joints], bool)
-        self.places, self.kept = [], False
+        self.sets, self.kept = [], False
         numbers = [i for i, joint in enumerate(model.scene.body_joints) if joint.call == "hinge"]
         for part in model.coupled.sets if numbers else ():
             if part.term.name == "hinge":
@@ -31,7 +31,7 @@ class JointDrives:
                 index = np.array([element[number] for number in numbers])
                 for name in (REST, TORQUE):
                     part.parameters.prescribe(name, (model.worlds, part.elements))
-                self.places.append((part, index + part.elements * np.arange(model.worlds)[:, None]))
+                self.sets.append((part, index + part.elements * np.arange(model.worlds)[:, None]))
 
     def to(self, t: float, factor: float = 1.0, controls: Mapping | None = None) -> None:
         """Write the values at a time, or at a load parameter `factor` of statics, which scales constant torques.
@@ -51,7 +51,7 @@ class JointDrives:
         )
         angles = controls.get("angles", angles)
         torques = torques + factor * controls.get("torques", 0.0)
-        for part, index in self.places:
+        for part, index in self.sets:
             part.parameters.write(REST, [(index, np.broadcast_to(np.where(self.driven, angles, 0.0), index.shape))])
             part.parameters.write(TORQUE, [(index, np.broadcast_to(torques, index.shape))])
 

@@ -96,7 +96,7 @@ class StepControls:
 
     @contextmanager
     def driven(self):
-        """Keep what `give_drives` has written."""
+        """Keep the values of `give_drives` within the block."""
         self.model.drives.kept = True
         try:
             yield
@@ -106,8 +106,8 @@ class StepControls:
     def _hinges(self) -> list[tuple]:
         """Return element sets with hinges, and the indices of the hinges (worlds, hinges) as tensors."""
         drives = self.model.drives
-        indices = self.layout.places("hinges", lambda: [index for _, index in drives.places])
-        return [(part, index) for (part, _), index in zip(drives.places, indices, strict=True)]
+        indices = self.layout.places("hinges", lambda: [index for _, index in drives.sets])
+        return [(part, index) for (part, _), index in zip(drives.sets, indices, strict=True)]
 
     @property
     def _driven(self) -> torch.Tensor:

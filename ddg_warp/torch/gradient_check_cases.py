@@ -193,8 +193,9 @@ class Case:
         if self.model.grips:
             yield self._control("poses", 0.1, self._normal(WORLDS, len(self.model.grips), 6), self.poses)
         if self.bodies:
-            size = self._tensor([1.0] * 3 + [1e-2] * 3)
-            yield self._control("wrenches", 0.1, self._normal(WORLDS, self.bodies, 6) * size)
+            size, shape = self._tensor([1.0] * 3 + [1e-2] * 3), (WORLDS, self.bodies, 6)
+            usual = 0.0 if self.statics else 0.3 * self._normal(*shape) * size  # moments have no potential
+            yield self._control("wrenches", 0.1, self._normal(*shape) * size, usual)
         if hinges := len(self.model.drives.joints):
             yield self._control("torques", 1e-3, self._normal(WORLDS, hinges))
             driven = [joint.angle or 0.0 for joint in self.model.drives.joints]

@@ -168,7 +168,7 @@ def _fixed_on_ball(**friction) -> Callable:
 
 
 def _on_box(scene: Scene, material: Material) -> None:
-    """Add a rod on a rigid box, which rubs a plane."""
+    """Add a rod on a rigid box on a plane, with friction."""
     scene.add_rod(CURVE, section=Circle(0.004), material=material)
     scene.add_body(
         Box((0.18, 0.05, -0.085), (0.05, 0.04, 0.03), radius=0.004), density=300.0, angular_velocity=(1.0, 2.0, 3.0)

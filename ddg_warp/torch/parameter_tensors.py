@@ -12,6 +12,8 @@ from ddg_warp.model.parameters import valid_numbers
 from ddg_warp.torch import named_parameters, user_force_parameters
 from ddg_warp.torch.parameter_storage import ArrayParameterView, TermParameterView
 
+DRIVEN = {f"hinge.{parameter}": control for control, parameter in PARAMETERS.items()}  # controls of driven parameters
+
 
 class ParameterTensors:
     """Parameters of a model: names and values, writes of tensors to storage, and gradients.
@@ -44,10 +46,11 @@ class ParameterTensors:
             else:
                 storage = self._of_terms(name)
             if any(isinstance(view, TermParameterView) and view.prescribed for view in storage[1]):
-                control = next((key for key, own in PARAMETERS.items() if name == f"hinge.{own}"), None)
-                given = "{'fields': {name: tensor}}" if control is None else f"{{'{control}': tensor}}"
-                by = "a field of the scene" if control is None else "the drives of hinges"
-                raise SceneError(f"parameters: {name} is prescribed by {by}; give controls={given}")
+                if name in DRIVEN:
+                    raise SceneError(f"parameters: {name} drives hinges; give controls={{'{DRIVEN[name]}': tensor}}")
+                raise SceneError(
+                    f"parameters: {name} is prescribed by a field of the scene; give controls={{'fields': {{name: tensor}}}}"
+                )
             if not storage[1]:
                 near = argument_checks.nearest(name, self.names())
                 raise SceneError(f"parameters: no object has {name!r}; this model has {', '.join(self.names())}{near}")
@@ -71,9 +74,9 @@ class ParameterTensors:
         model = self.model
         result = {name for group in model.groups for name in group.parameters.values}
         for part in model.coupled.sets if model.coupled is not None else ():
-            driven = PARAMETERS.values() if part.term.name == "hinge" else ()
-            names = part.parameters.prescribed.intersection(driven)
-            result.update(f"{part.term.name}.{name}" for name in part.parameters.values if name not in names)
+            result.update(f"{part.term.name}.{name}" for name in part.parameters.values)
+        if model.drives.joints:
+            result -= DRIVEN.keys()
         return sorted(result) + [
             *(name for name in named_parameters.NAMES if named_parameters.array_views(model, name)[1]),
             *user_force_parameters.names(model),

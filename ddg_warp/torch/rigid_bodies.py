@@ -8,11 +8,13 @@ import torch
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.elements.coupled_element import FRAME
 
-CLOSE = 1e-6  # tolerated deviation of rotations from orthonormal ones, and of centres, relative to arms, from what a joint allows
+CLOSE = (
+    1e-6  # tolerated deviation of rotations from orthonormal ones, and of centres from their joints, relative to arms
+)
 
 
 class BodyLayout:
-    """Rigid bodies of a model in the tensors of its states.
+    """Layout of rigid bodies in the tensors of states.
 
     Args:
         layout: `StateLayout` of a model with rigid bodies.
@@ -23,22 +25,22 @@ class BodyLayout:
         self.layout, self.worlds, self.coupled = layout, model.worlds, model.coupled
         host = self._host = model.coupled.host.rigid_bodies
 
-        def put(values, dtype=None):
+        def upload(values, dtype=None):
             return torch.as_tensor(np.ascontiguousarray(values), device=layout.device, dtype=dtype)
 
         self._real = layout.real
-        self._axes, self._moments, self._arms = (put(v, self._real) for v in (host.axes, host.moments, host.arms))
+        self._axes, self._moments, self._arms = (upload(v, self._real) for v in (host.axes, host.moments, host.arms))
         self._origins, self._centers, self._carried, self._owner = (
-            put(v, torch.long) for v in (host.origins, host.centers, host.carried, host.owner)
+            upload(v, torch.long) for v in (host.origins, host.centers, host.carried, host.owner)
         )
-        self._pinned = put(host.pinned)
+        self._pinned = upload(host.pinned)
         place = np.full(model.coupled.blocks, -1)
         place[host.carried] = np.arange(len(host.carried))
         center = place[host.centers]  # carried node of the centre of a pinned body
         arms = np.zeros((len(host), 3))
         arms[center >= 0] = host.arms[center[center >= 0]]
-        self._center_arms = put(arms, self._real)
-        self._ghosts = list(self._find_ghosts(put))
+        self._center_arms = upload(arms, self._real)
+        self._ghosts = list(self._find_ghosts(upload))
 
     def poses(self, values) -> torch.Tensor:
         """Return rotation and position of the bodies, [R | x] (B, bodies, 3, 4)."""
@@ -116,7 +118,7 @@ class BodyLayout:
     def _momentum(self, values) -> torch.Tensor:
         return self._blocks(values, "momentum")
 
-    def _find_ghosts(self, put):
+    def _find_ghosts(self, upload):
         """Yield index, number of frames, bodies of ghosts (n for none), edges and directions of sets with ghosts of bodies."""
         host, coupled, bodies = self._host, self.coupled, len(self._host)
         body = np.full(coupled.blocks, bodies)
@@ -129,7 +131,8 @@ class BodyLayout:
                 edges = slots[measure.nodes] - coupled.host.nodes if measure.frames else np.zeros(0, int)
                 sign = part.host.data[0] if measure.frames else np.zeros(0)
                 if (owners < bodies).any():
-                    yield i, measure.frames, put(owners, torch.long), put(edges, torch.long), put(sign, self._real)
+                    arrays = upload(owners, torch.long), upload(edges, torch.long), upload(sign, self._real)
+                    yield i, measure.frames, *arrays
 
     def _turn_ghosts(self, values, turn: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return lagged rows by name with the ghosts of bodies rotated by `turn` (B, bodies, 3, 3)."""
@@ -139,13 +142,13 @@ class BodyLayout:
             rows = values[self.layout.index(f"net/lag_{i}")].reshape(-1, self.worlds, owners.shape[1])
             ghosts = rows[:-1].reshape(-1, 2, 3, *rows.shape[1:])  # (ghosts, u and t, 3, worlds, elements)
             ghosts = torch.einsum("wgeij,gvjwe->gviwe", turn[:, owners], ghosts)
-            (u, t), other = ghosts[0], ghosts[-1]
+            (u, t), second = ghosts[0], ghosts[-1]
             if frames:
                 frame = values[self.layout.index("net/frame")].reshape(FRAME, self.worlds, -1)[:, :, edges]
-                other = (
+                second = (
                     frame.reshape(2, 3, *frame.shape[1:]) * torch.stack([torch.ones_like(sign), sign])[:, None, None]
                 )
-            twist = _reference_twist(u, other[0], t, other[1], rows[-1])
+            twist = _reference_twist(u, second[0], t, second[1], rows[-1])
             new = torch.cat([ghosts.reshape(-1, *rows.shape[1:]), twist[None]])
             result[f"lag_{i}"] = new.reshape(new.shape[0], -1)
         return result

@@ -139,7 +139,7 @@ class Simulator(torch.nn.Module):
                 `world_state` makes states without it.
             body_poses: rotation and position of rigid bodies, [R | x], (bodies, 3, 4) or (B, bodies, 3, 4), as of
                 `WorldState.body_poses`. Nodes that bodies carry follow. Gradients are along rotations.
-            body_rates: velocity of the centre and angular velocity (bodies, 6) or (B, bodies, 6), by default those of the scene.
+            body_rates: velocity of the centre and angular velocity (bodies, 6) or (B, bodies, 6), by default the rates of the scene.
 
         Raises:
             SceneError: shapes do not fit, or surfaces in contact overlap (under transforms of torch, reported by steps).

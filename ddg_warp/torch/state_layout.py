@@ -178,7 +178,7 @@ class StateLayout:
         return self._places[key]
 
     def index(self, name: str) -> int | None:
-        """Return the index of an array of a state among its tensors, None without."""
+        """Return the index of the tensor with a name; None without."""
         return next((i for i, field in enumerate(self.fields) if field.name == name), None)
 
     def _picked(self, key: str, values: list[torch.Tensor], find) -> torch.Tensor:

@@ -3,8 +3,8 @@
 Gradients by an orientation R are vectors t of space: a small rotation [a] R changes the loss by t . a. A state has them as the
 matrix [t] R / 2.
 
-The solve finds c and w at given P. Its residual has the moments T^T (y x f) of carried nodes, so that the exact matrix has, beside the
-Gauss-Newton matrix of `kernels.rigid_bodies.condensation`, the second derivative
+The solve finds c and w at given P. Its residual has the moments T^T (y x f) of carried nodes. The exact matrix is the Gauss-Newton
+matrix of `kernels.rigid_bodies.condensation` plus the second derivative
 
     -f . d^2 x / dw^2 = -(d(T^T m) / dw)_sym - T^T ((G + G^T) / 2 - tr(G) I) T ,   G = sum_j f_j y_j^T ,   m = sum_j y_j x f_j .
 
@@ -18,6 +18,7 @@ from functools import cache
 
 import warp as wp
 
+from ddg_warp.kernels.adjoint.rotation import work_gradient_function
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
 from ddg_warp.kernels.measures.joint_curvature_twist import rotations
 from ddg_warp.kernels.rigid_bodies.condensation import bodies_type
@@ -48,17 +49,12 @@ def gradients_type(real):
 
 @cache
 def functions(real):
-    """Return the device functions `work`, `axial`, `times_inertia` and `turning_inertia`.
+    """Return the device functions `axial`, `times_inertia` and `turning_inertia`.
 
-    `work(w, u, z)`: u . T(w) z. `axial(A)`: the vector t of A : [a] = t . a.
+    `axial(A)`: the vector t of A : [a] = t . a.
     `times_inertia(P, I, v)`: P I P^T v. `turning_inertia(z, w, Bz, Bw)`: gradient of z . B w by rotations of B = P I P^T.
     """
     V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
-    _, transposed, *_ = rotations(real)
-
-    @wp.func
-    def work(w: V, u: V, z: V):
-        return wp.dot(transposed(w, u), z)
 
     @wp.func
     def axial(A: M):
@@ -72,7 +68,7 @@ def functions(real):
     def turning_inertia(z: V, w: V, Bz: V, Bw: V):
         return wp.cross(Bw, z) - wp.cross(w, Bz)
 
-    return work, axial, times_inertia, turning_inertia
+    return axial, times_inertia, turning_inertia
 
 
 @cache
@@ -82,7 +78,7 @@ def end_kernel(real):
     It moves the gradients by carried nodes (`q`, `v`) to the bodies, and adds the gradient by the solution to `by_solution`.
     """
     V, M, Gradients = wp.types.vector(3, real), wp.types.matrix((3, 3), real), gradients_type(real)
-    work, axial, times_inertia, turning_inertia = functions(real)
+    (axial, times_inertia, turning_inertia), work_gradient = functions(real), work_gradient_function(real)
     turned, _, tangent, _ = rotations(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -141,8 +137,7 @@ def end_kernel(real):
         u = wp.inverse(wp.transpose(T)) * Bx
         z = wp.inverse(T) * (by_l * rate)
         Bz = times_inertia(P, inertia, z)
-        dx, _du, _dz = wp.grad(work)(x, u, z)
-        by_solution[k] = by_solution[k] + wp.transpose(T) * turn + Bz - dx
+        by_solution[k] = by_solution[k] + wp.transpose(T) * turn + Bz - work_gradient(x, u, z)
         by_moments += wp.cw_mul(wp.transpose(P) * z, wp.transpose(P) * x)
         along, kept = wp.dot(by_l, momentum_before[i]), rate + damping
         out.predicted[i] = out.predicted[i] + turned(-x, turn) + turning_inertia(z, x, Bz, Bx)
@@ -161,12 +156,13 @@ def solve_kernels(real, linear):
     `condense`: move the gradients by carried nodes to the dofs of their bodies.
     `stiffen`: add the second derivatives of rotations to the matrix; see the module.
     `correct`: add to `out` the component of the matrix at a solution w that has no potential.
+    `settle`: mark worlds where a correction has changed the solution by more than the fraction `missed`.
     `pull`: gradients of the residual by P, moments, controls, rate and damping, and of all nodes by P. Then move the gradients by
     carried nodes to the origins.
     """
     V, M = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
     Bodies, Gradients = bodies_type(real), gradients_type(real)
-    work, axial, times_inertia, turning_inertia = functions(real)
+    (axial, times_inertia, turning_inertia), work_gradient = functions(real), work_gradient_function(real)
     turned, _, tangent, bent = rotations(real)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
@@ -214,8 +210,21 @@ def solve_kernels(real, linear):
         w, b = wp.tid()
         i, k = w * bodies.origins.shape[0] + b, bodies.spins[b] + w * blocks
         x, moment, z = solution[k], bodies.moment[i], adjoint[k]
-        dx, _dm, _dz = wp.grad(work)(x, moment, z)
-        out[k] = out[k] + dx - bent(x, moment) * z
+        out[k] = out[k] + work_gradient(x, moment, z) - bent(x, moment) * z
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def settle(
+        spins: wp.array(dtype=int),
+        before: wp.array(dtype=V),
+        adjoint: wp.array(dtype=V),
+        blocks: int,
+        missed: real,
+        failed: wp.array(dtype=int),
+    ):
+        w, b = wp.tid()
+        k = spins[b] + w * blocks
+        if not wp.length(adjoint[k] - before[k]) <= missed * wp.length(adjoint[k]):
+            failed[w] = 1
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pull(
@@ -258,7 +267,7 @@ def solve_kernels(real, linear):
         out.rate[i] = out.rate[i] + by_c * (real(2.0) * rate + damping)
         out.damping[k] = out.damping[k] + by_c * rate
 
-    return condense, stiffen, correct, pull
+    return condense, stiffen, correct, settle, pull
 
 
 @cache

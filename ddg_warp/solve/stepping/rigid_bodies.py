@@ -14,12 +14,12 @@ class RigidBodyStep:
 
     Attributes:
         acceleration: mean accelerations of the centres of mass over the last substep (W B,) [m/s^2].
-        pushed: True with wrenches of controls.
+        has_wrenches: True with wrenches of controls.
     """
 
     def __init__(self, newton, midpoint: bool):
         self.newton, self.bodies, self.tables = newton, newton.rigid_bodies, newton.rigid_bodies.tables
-        self.pushed = False
+        self.has_wrenches = False
         self.coupled, real = newton.coupled, newton.coupled.real
         self.acceleration = wp.zeros(
             self.coupled.worlds * len(self.tables), dtype=self.coupled.vector, device=self.coupled.device
@@ -36,9 +36,9 @@ class RigidBodyStep:
 
     def push(self, wrenches: np.ndarray | None) -> None:
         """Set forces at the centres and moments on all bodies (1 or worlds, bodies, 6), none without."""
-        if wrenches is None and not self.pushed:
+        if wrenches is None and not self.has_wrenches:
             return
-        self.pushed = wrenches is not None
+        self.has_wrenches = wrenches is not None
         shape = self.coupled.worlds, len(self.tables), 6
         values = np.broadcast_to(0.0 if wrenches is None else wrenches, shape).reshape(-1, 6)
         struct = self.bodies.bodies

@@ -1,0 +1,84 @@
+"""Gradients through rigid bodies: conservation, large rotations within a step, and refusals.
+
+`test_gradients_table.py` compares every input of rods with bodies with differences.
+"""
+
+import pytest
+
+import ddg_warp as ddg
+
+torch = pytest.importorskip("torch")
+from ddg_warp.torch import Simulator  # noqa: E402
+from ddg_warp.torch.rotations import matrix, quaternion  # noqa: E402
+
+REAL = torch.float64
+INERTIA = (2e-3, 3e-3, 4e-3)
+
+
+def top(device, dt: float = 0.02, **options) -> Simulator:
+    """Return the simulator of a free asymmetric top."""
+    scene = ddg.Scene(gravity=(0.0, 0.0, 0.0), **options)
+    scene.add_body(mass=2.0, inertia=INERTIA, center=(0.1, 0.0, 0.2), angular_velocity=(1.0, 20.0, 2.0))
+    return Simulator(scene.build(device=device, precision="float64"), dt, rtol=1e-13)
+
+
+def differences(function, x: torch.Tensor, h: float = 1e-3) -> torch.Tensor:
+    """Return derivatives of a number by central differences of fourth order."""
+    result = torch.zeros_like(x)
+    for i in range(x.numel()):
+        e = torch.zeros_like(x)
+        e.view(-1)[i] = h
+        near, far = function(x + e) - function(x - e), function(x + 2.0 * e) - function(x - 2.0 * e)
+        result.view(-1)[i] = (8.0 * near - far) / (12.0 * h)
+    return result
+
+
+def test_momenta_of_a_free_top_are_kept(device):
+    """d l_n / d l_0 = 1 and d x_n / d v_0 = n h, to rounding."""
+    simulator, steps = top(device), 5
+    rates = torch.randn((2, 1, 6), generator=torch.Generator().manual_seed(1), dtype=REAL).to(simulator.device)
+    rates = (10.0 * rates).requires_grad_()
+    start = simulator.initial_state(batch=2, body_rates=rates)
+    end = simulator.rollout(start, steps=steps)[-1]
+    weights = torch.tensor([1.0, -2.0, 3.0], dtype=REAL, device=simulator.device)
+
+    def by_rates(state):
+        return torch.autograd.grad((state.body_momenta * weights).sum(), rates, retain_graph=True)[0]
+
+    torch.testing.assert_close(by_rates(end), by_rates(start), rtol=1e-12, atol=1e-14)
+    (by_velocity,) = torch.autograd.grad((end.body_poses[..., 3] * weights).sum(), rates)
+    torch.testing.assert_close(by_velocity[..., :3], (steps * 0.02 * weights).expand(2, 1, 3), rtol=1e-12, atol=1e-14)
+    assert by_velocity[..., 3:].abs().max() == 0.0
+
+
+def test_a_pushed_top_turns_far(device):
+    """Moments that rotate a body by 0.2 rad within a step have no potential; pose, rates, inertia and wrench against differences."""
+    simulator = top(device, mass_damping=0.5)
+    generator = torch.Generator().manual_seed(2)
+    normal = torch.randn((4, 3), generator=generator, dtype=REAL).to(simulator.device)
+    weights = torch.randn((2, 18), generator=generator, dtype=REAL).to(simulator.device)
+    base = torch.cat([normal[0], 5.0 * normal[1], normal[2], torch.zeros(3, dtype=REAL, device=simulator.device)])
+
+    def loss(x):
+        turn, rates, moment, logarithms = x.split(3)
+        usual = simulator.initial_state(batch=2)
+        rotation = matrix(quaternion(turn)) @ usual.body_poses[..., :3]
+        state = simulator.initial_state(
+            body_poses=torch.cat([rotation, usual.body_poses[..., 3:]], -1),
+            body_rates=usual.body_rates + torch.cat([rates, rates]),
+        )
+        worlds = torch.tensor([[[1.0]], [[-0.5]]], dtype=REAL, device=simulator.device)
+        wrench = worlds * torch.cat([rates, moment])
+        inertia = simulator.parameter("body.inertia") * logarithms.exp()
+        for _ in range(3):
+            state = simulator.step(state, {"body.inertia": inertia}, {"wrenches": wrench})
+        values = torch.cat([state.body_poses.flatten(1), state.body_rates.flatten(1)], 1)
+        return (values * weights).sum()
+
+    x = base.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(x), x)
+    expected = differences(lambda y: loss(y).detach(), base)
+    assert ((gradient - expected).abs() <= 1e-6 * expected.abs().clamp_min(0.1 * expected.abs().max())).all(), (
+        gradient,
+        expected,
+    )
