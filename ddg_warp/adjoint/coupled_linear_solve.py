@@ -81,9 +81,9 @@ class CoupledLinearSolve:
             self.system.solve(state, coefficient, self._rate, rhs, w)
             return
         if self.system and (self.system.contact or self.system.rigid_bodies):
-            subject = "contact" if self.system.contact else "rigid bodies"
+            part = "contact" if self.system.contact else "rigid bodies"
             raise SolverError(
-                f"{subject}: conjugate gradients have not solved the reverse of the step: no gradient goes through it; take a smaller dt",
+                f"{part}: conjugate gradients have not solved the reverse of the step: no gradient goes through it; take a smaller dt",
                 outcome="no_gradient",
             )
         tangent, host = self.tangent, self._host
