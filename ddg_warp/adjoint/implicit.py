@@ -4,7 +4,8 @@ A step solves the residual equation f(q; state, parameters, ...) = 0 for its dof
 adjoint solve H^T w = g uses the exact Hessian H at the solution, once per step. The gradient with respect to every other argument
 of f is that of w . f, which Warp's reverse mode computes element by element. The stages around the solve (inertia, velocities,
 transported frames, joint ghost nodes, strains of damping) have VJPs of their own. See Tortorelli and Michaleris, Inverse Problems
-in Engineering 1, 1994, 71, for the method, and `ddg_warp.kernels.elements.variation` for the elements.
+in Engineering 1, 1994, 71, for the method, and `ddg_warp.kernels.elements.variation` for the elements. Rigid bodies add the reverse
+of free flight and of their poses, see `ddg_warp.kernels.adjoint.rigid_bodies`.
 
 The gradient with respect to a state is a `State` whose arrays hold the derivatives: `points()` returns the gradient with respect to
 positions, in user order.

@@ -8,7 +8,6 @@ stiffness k_l: the last bracket is the closest angle between the stops.
 
 from functools import cache
 
-import numpy as np
 import warp as wp
 
 from ddg_warp.kernels.densities import FINITE, NOT_NEGATIVE, Density, Parameter, each
@@ -61,8 +60,8 @@ def _parameters(n):
         *each(6, "rest", "m; rad of angles", FINITE, rest=True, default=0.0),
         Parameter("damping", "N m s", NOT_NEGATIVE, default=0.0),
         Parameter("torque", "N m", FINITE, default=0.0),
-        Parameter("lower", "rad", ("a number", lambda v: ~np.isnan(v)), default=-1e30),
-        Parameter("upper", "rad", ("a number", lambda v: ~np.isnan(v)), default=1e30),
+        Parameter("lower", "rad", ("a number", lambda v: abs(v) >= 0.0), default=-1e30),
+        Parameter("upper", "rad", ("a number", lambda v: abs(v) >= 0.0), default=1e30),
         Parameter("stop", "N m", NOT_NEGATIVE, default=0.0),
     )
 

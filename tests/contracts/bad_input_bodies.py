@@ -1,6 +1,8 @@
 """Bad inputs to rigid bodies: shapes, masses, inertia, attachments, joints, contact and queries."""
 
 # fmt: off
+from importlib.util import find_spec
+
 import numpy as np
 from bad_inputs import DEVICE, INF, NAN, STIFFNESS, built, each, line, refuse
 
@@ -144,3 +146,57 @@ def _state():
 
 
 each("queries of bodies", "body", [2, -1, "odd", 0.5], lambda v: _state().body(v), "body")
+
+# --- with torch ---
+if find_spec("torch"):
+    import torch
+
+    from ddg_warp.torch import Simulator
+
+    def simulator(*add, pinned: bool = False, count: int = 1, scheme: str = "implicit_euler", **contact) -> Simulator:
+        """Return steps of bodies on a rod, the first pinned to the world."""
+        scene, made = bodies(*range(1 - pinned), count=count)
+        if pinned:
+            scene.hinge(made[0], point=(0.0, 0.2, 0.0), axis=(0.0, 0.0, 1.0), torque=0.1)
+        for more in add:
+            more(scene)
+        if contact:
+            scene.contact(**contact)
+        return Simulator(scene.build(DEVICE, "float64"), 0.01, scheme=scheme)
+
+    def start(rotation=np.eye(3), shift=0.0, **options):  # noqa: B008
+        made = simulator(**options)
+        poses = made.initial_state().body_poses.clone()
+        poses[..., :3], poses[..., 3] = torch.as_tensor(rotation), poses[..., 3] + shift
+        return made.initial_state(body_poses=poses)
+
+    def gradient(*add, rests: bool = False, **options):
+        made = simulator(*add, **options)
+        wrenches = torch.zeros((1, 1, 6), dtype=torch.float64, requires_grad=True)
+        if rests:
+            return made.equilibrium(controls={"wrenches": wrenches}).positions.sum().backward()
+        return made.step(made.initial_state(), controls={"wrenches": wrenches}).body_rates.sum().backward()
+
+    def stepped(parameter: str):
+        made = simulator(pinned=True)
+        return made.step(made.initial_state(), {parameter: 1.0})
+
+    def follow(scene):
+        scene.add_couple(0, -1, (0.0, 0.0, 1e-3))
+
+    def clamp(scene):
+        scene.clamp_end(0, "last")
+
+    each("gradients of bodies", "rotation", [2.0 * np.eye(3), np.diag([1.0, 1.0, -1.0])], start, "body_poses: body 0", "R^T R = 1")
+    each("gradients of bodies", "rates", [np.zeros(6), np.zeros((2, 6))], lambda v: simulator().initial_state(body_rates=v),
+         "initial_state: body_rates have shape", "(1, 6)")
+    refuse("gradients of bodies", {
+        "poses without bodies": (lambda: simulator(count=0).initial_state(body_rates=np.zeros((0, 6))), "no rigid body", "add_body"),
+        "a centre off its joint": (lambda: start(shift=0.1, pinned=True), "centre of body 0", "about the point"),
+        "the mass of a pinned body": (lambda: stepped("body.mass"), "no object has 'body.mass'", "body.inertia"),
+        "the torque as a parameter": (lambda: stepped("hinge.torque"), "hinge.torque drives hinges", "controls={'torques'"),
+        "the midpoint rule": (lambda: gradient(scheme="implicit_midpoint"), "body 0 ('ball 0')", "midpoint rule", "use"),
+        "an equilibrium": (lambda: gradient(clamp, rests=True), "body 0 ('ball 0')", "in equilibrium", "'implicit_euler'"),
+        "follower loads": (lambda: gradient(follow), "body 0 ('ball 0')", "follower loads", "leave them out"),
+        "friction iterations": (lambda: gradient(range=1e-3, friction=0.1, friction_iterations=2), "friction iterations", "set"),
+    })
