@@ -59,9 +59,9 @@ class Simulator(torch.nn.Module):
 
     Parameters are tensors (), (B, 1), (1, E) or (B, E) by name, E the number of elements with the parameter. Names are
     "term.parameter" (see `Model.set_parameter`), or listed in `ddg_warp.torch.named_parameters`. Controls are dictionaries of "forces"
-    (B, P, 3) or (P, 3), "moments" (B, edges), "gravity" and "field" (B, 3) or (3,), "poses" (B, grips, 6), "angles" and "torques"
-    (B, hinges), "wrenches" (B, bodies, 6), and "fields", a dictionary of tensors by name, see `Controls`. A world with a value
-    that `set_parameter` would refuse, or with a control that is not finite, is not stepped. The outcome is then
+    (B, P, 3) or (P, 3), "moments" (B, edges), "gravity" and "field" (B, 3) or (3,). Grips take "poses" (B, grips, 6), hinges "angles"
+    and "torques" (B, hinges), bodies "wrenches" (B, bodies, 6). "fields" is a dictionary of tensors by name, see `Controls`. A world
+    with a value that `set_parameter` would refuse, or with a control that is not finite, is not stepped. The outcome is then
     "invalid_input".
 
     Raises:
