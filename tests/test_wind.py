@@ -267,7 +267,7 @@ def test_wrench_of_a_fixed_plate(device, scheme):
 
 
 def test_missing_gradients_are_refused():
-    """Names: a function of position of a user, wrenches with drag of shells, and the radius of rods in a quadratic law."""
+    """Names: a function of position of a user, wrenches by coefficients of shells, the radius of rods in a quadratic law."""
     from ddg_warp.adjoint.implicit import Adjoint
 
     model = plate("cpu", flow=lambda points, t: points)
@@ -278,8 +278,9 @@ def test_missing_gradients_are_refused():
 
     simulator = Simulator(plate("cpu"), 0.01)
     state = simulator.initial_state()
-    with pytest.raises(ddg.SceneError, match="wrenches with drag of shells"):
-        simulator.wrenches(state, simulator.step(state))
+    coefficients = {"shell_drag.normal": simulator.parameter("shell_drag.normal")}
+    with pytest.raises(ddg.SceneError, match=r"wrenches by shell_drag\.normal"):
+        simulator.wrenches(state, simulator.step(state, coefficients), coefficients)
     scene = ddg.Scene()
     scene.add_rod(np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 5), section=ddg.Circle(0.01), material=CLOTH)
     scene.drag(law=ddg.QuadraticDrag(RHO))

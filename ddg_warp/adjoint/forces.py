@@ -205,7 +205,7 @@ class CoupledDragAdjoint(DragAdjoint):
         self.by_coefficients, by_rate = (wp.zeros(shape, dtype=real, device=device) for shape in ((ROWS, count), count))
         by_rate_of_nodes = wp.zeros(coupled.worlds * coupled.blocks, dtype=real, device=device)
         self.rates = by_rate_of_nodes, by_rate
-        self._triangles = coupled.host.drag_triangles
+        self._triangles, self._has_rods = coupled.host.drag_triangles, bool(coupled.coefficients)
         if len(self._triangles):
             self._shell_kernels = shell_drag.pull_kernels(coupled.nodes, real, *self._laws)
             values = self._triangles, *lists(self._triangles.ravel(), coupled.blocks)
@@ -222,14 +222,12 @@ class CoupledDragAdjoint(DragAdjoint):
     def by_names(self) -> dict[str, wp.array]:
         """See `DragAdjoint`."""
         of_shells = {"shell_drag": self.by_shell_coefficients} if len(self._triangles) else {}
-        return (super().by_names if self.force.coefficients is not None else {}) | of_shells
+        return (super().by_names if self._has_rods else {}) | of_shells
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
-        of_rods = (
-            super().kernels if self.force.coefficients is not None else [*self._field_kernels, *self.force.kernels]
-        )
+        of_rods = super().kernels if self._has_rods else [*self._field_kernels, *self.force.kernels]
         return [*of_rods, *(self._shell_kernels if len(self._triangles) else ())]
 
     def resist(self, before, tangents: wp.array, rate: float) -> None:
@@ -260,7 +258,7 @@ class CoupledDragAdjoint(DragAdjoint):
         by_fixed, start = components(pull.by_fixed), coupled.node_state(pull.start)
         state, x, w = coupled.node_state(before), points(pull.solved.q), components(pull.w)
         flow = self.force.flow.array
-        if self.force.coefficients is not None:
+        if self._has_rods:
             read = [tangents, state, x, None, rows(self.force.coefficients), flow, w, pull.rate]
             outputs = [rows(self.by_coefficients), by_world(self.rates[1]), by_tangents, by_fixed, start]
             self._pull((*self._lists, None), read, *outputs)

@@ -228,7 +228,7 @@ class Simulator(torch.nn.Module):
 
         Raises:
             SceneError: the scheme is the midpoint rule. The model has several friction iterations, or follower loads on supports. A
-                parameter is of contact. A name or shape does not fit.
+                parameter is of contact or of drag of shells. A name or shape does not fit.
         """
         engine = self._own(after)
         if self._own(before) is not engine:

@@ -16,8 +16,11 @@ from ddg_warp.adjoint.contact import ContactAdjoint
 from ddg_warp.compile.support_dofs import NormalMoments, SupportDofs, matches
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.adjoint.element_forces import force_kernels
+from ddg_warp.kernels.forces.drag import ROWS
+from ddg_warp.scene.flow import is_on_host
 from ddg_warp.solve.forces.control_loads import loaded_rows
 from ddg_warp.solve.stepping.wrenches import coupled_elements_at, elements_at, support_count
+from ddg_warp.torch.named_parameters import SHELL_COEFFICIENTS
 from ddg_warp.torch.parameter_storage import ArrayParameterView, TermParameterView
 from ddg_warp.torch.quadratic_forces import QuadraticForces, QuadraticPotential, torch_stream
 from ddg_warp.torch.state_layout import view
@@ -152,7 +155,7 @@ def without_gradient(engine) -> str:
             for part, places in zip(parts, fixed, strict=True)
             for load in part.host.followers
         ),
-        "drag of shells": bool(model.scene.shell_drags),
+        "a flow that is a function of position": is_on_host(model.scene.flow),
     }
     return next((name for name, used in refused.items() if used), "")
 
@@ -188,7 +191,7 @@ class Wrenches:
             for place, values in zip(self.engine.tables.of(name)[1], tensors, strict=True):
                 if isinstance(place, TermParameterView):
                     parameter_tensors[place.index, place.is_rod_group, place.name] = values
-                elif isinstance(place, ArrayParameterView):
+                elif isinstance(place, ArrayParameterView) and name not in SHELL_COEFFICIENTS:
                     summed.setdefault((place.index, place.is_rod_group, place.key[1]), []).append((place, values))
                 else:
                     raise SceneError(f"wrenches: no gradient goes through wrenches by {name}; leave it out")
@@ -220,7 +223,8 @@ class _Part:
         self._support = self._long(dofs.support)
         self._share, self._first = self._numbers(dofs.share), self._long(dofs.first)
         self._nodes, self._angles = np.flatnonzero(~dofs.is_angle), np.flatnonzero(dofs.is_angle)
-        self._potential = QuadraticPotential(engine.model, part) if part.host.coefficients else None
+        has_drag = bool(part.host.coefficients) or (part is engine.model.coupled and part.host.quadratic)
+        self._potential = QuadraticPotential(engine.model, part) if has_drag else None
 
     def _long(self, values) -> torch.Tensor:
         return torch.as_tensor(np.array(values, np.int64), device=self._device)
@@ -328,7 +332,8 @@ class _Part:
 
     def _coefficients(self, key: tuple, parameter_tensors) -> torch.Tensor:
         """Return the coefficients of the force with a quadratic potential, in storage layout (rows, ...)."""
-        force, array = self._potential.force, self.part.host.coefficients[self._potential.force.name]
+        force = self._potential.force
+        array = self.part.host.coefficients.get(force.name, np.zeros((ROWS, 0)))
         values = list(self._numbers(np.tile(array, len(self._worlds))))
         for name, row in force.parameters.items():
             replacement = parameter_tensors.get((*key, f"{force.name}.{name}"))

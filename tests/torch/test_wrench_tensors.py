@@ -58,6 +58,13 @@ def rubbed(scene):
     scene.add_obstacle(ddg.Plane())
 
 
+def sheet_in_wind(scene):
+    scene.flow = ddg.Turbulence((3.0, 1.0, 2.0), 0.4, 0.2, seed=2, modes=16)
+    sheet(scene, "hinge")
+    scene.drag(law=ddg.QuadraticDrag(20.0))
+
+
+SCENES |= {"sheet_in_wind": sheet_in_wind}
 SCENES |= {"dragged": dragged, "in_sand": in_sand, "joined_and_dragged": joined_and_dragged, "pressed": pressed}
 SCENES |= {"magnetised": magnetised, "rubbed": rubbed}
 
