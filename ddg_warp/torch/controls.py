@@ -7,6 +7,7 @@ import torch
 import warp as wp
 
 from ddg_warp.kernels.core import outcome
+from ddg_warp.model.controls import DRIVES
 from ddg_warp.model.joint_drives import PARAMETERS
 from ddg_warp.solve.forces.control_loads import LOADS
 from ddg_warp.solve.forces.prescribed_motion import counts_revolutions, rotations_between
@@ -47,7 +48,7 @@ class StepControls:
                 if wrenches is None:
                     target.zero_()
                 else:
-                    target.copy_(wrenches[..., 3 * k : 3 * k + 3].reshape(-1, 3))
+                    target.copy_(torch.nan_to_num(wrenches[..., 3 * k : 3 * k + 3].reshape(-1, 3)))
         self.give_field(controls)
         if model.grips:
             target = view(engine.after.grips.pose)
@@ -90,7 +91,7 @@ class StepControls:
             if name not in controls:
                 continue
             for part, index in self._hinges():
-                table, value = part.parameters, controls[name]
+                table, value = part.parameters, torch.nan_to_num(controls[name])  # of invalid worlds
                 memory = view(table.buffer).narrow(0, table.offsets[parameter], self.model.worlds * part.elements)
                 memory[index] = memory[index] + value if name == "torques" else value * self._driven
 
@@ -125,7 +126,10 @@ class StepControls:
         return total * flags[-1][:, None] * (self._driven if name == "angles" else 1.0)
 
     def give_fields(self, t: float, controls: dict) -> None:
-        """Write the fields at a time to parameter memory, of the scene, then tensors; worlds that are not finite are invalid."""
+        """Write the fields at a time to parameter memory, of the scene, then tensors.
+
+        Worlds whose fields, drives of hinges or wrenches are not finite are invalid.
+        """
         fields, tables = self.model.fields, self.engine.tables
         if self._has_tensors:
             fields.forget()
@@ -133,9 +137,10 @@ class StepControls:
         fields.to(t)
         self._has_tensors = False
         for name, value in controls.items():
-            if name.startswith(FIELD):
+            if name.startswith(FIELD) or name in (*DRIVES, "wrenches"):
                 self._has_tensors = True
-                tables.invalid.masked_fill_(~torch.isfinite(value).all(1), outcome.INVALID_INPUT)
+                tables.invalid.masked_fill_(~torch.isfinite(value).flatten(1).all(1), outcome.INVALID_INPUT)
+            if name.startswith(FIELD):
                 for part, row, size, indices, elements in self._storage(name):
                     table = part.parameters
                     memory = view(table.buffer).narrow(0, table.offsets[row], size)

@@ -218,7 +218,7 @@ class Engine:
         self.controls.give_drives(self.integrator.evaluation_time(start, dt), controls)
         pushed = self.model.rigid_bodies is not None and "wrenches" in controls
         if pushed:
-            view(self._moment).copy_(controls["wrenches"][..., 3:].reshape(-1, 3))
+            view(self._moment).copy_(torch.nan_to_num(controls["wrenches"][..., 3:].reshape(-1, 3)))
         self._fill_all((before, after, cotangent), other_results)
         if adjoint.upload(start, dt):
             self._graphs.clear()

@@ -44,14 +44,19 @@ class BodyLayout:
 
     def poses(self, values) -> torch.Tensor:
         """Return rotation and position of the bodies, [R | x] (B, bodies, 3, 4)."""
-        position = self._blocks(values, "q")[:, self._centers]
-        return torch.cat([self._rotation(values) @ self._axes.transpose(1, 2), position[..., None]], -1)
+        position, rotation = self._blocks(values, "q")[:, self._centers], torch.nan_to_num(self._rotation(values))
+        return torch.cat([self._of_good(values, rotation @ self._axes.transpose(1, 2)), position[..., None]], -1)
 
     def rates(self, values) -> torch.Tensor:
         """Return velocities of centres and angular velocities (B, bodies, 6)."""
-        rotation, momentum = self._rotation(values), self._momentum(values)
+        rotation, momentum = map(torch.nan_to_num, (self._rotation(values), self._momentum(values)))
         spin = torch.einsum("wbij,wbj->wbi", rotation, _turned_back(rotation, momentum) / self._moments)
-        return torch.cat([self._blocks(values, "v")[:, self._centers], spin], -1)
+        return torch.cat([self._blocks(values, "v")[:, self._centers], self._of_good(values, spin)], -1)
+
+    def _of_good(self, values, result: torch.Tensor) -> torch.Tensor:
+        """Return a result (B, ...), NaN in failed worlds, to which zero cotangents then pass nothing else."""
+        failed = torch.isnan(self._momentum(values)).flatten(1).any(1)
+        return torch.where(failed.view(-1, *[1] * (result.ndim - 1)), torch.nan, result)
 
     def momenta(self, values) -> torch.Tensor:
         """Return angular momenta (B, bodies, 3)."""

@@ -82,3 +82,17 @@ def test_a_pushed_top_turns_far(device):
         gradient,
         expected,
     )
+
+
+def test_a_world_without_a_finite_wrench_fails_alone(device):
+    simulator = top(device)
+    wrench = torch.ones((3, 1, 6), dtype=REAL, device=simulator.device)
+    wrench[1, 0, 4] = torch.nan
+    wrench.requires_grad_()
+    state = simulator.step(simulator.initial_state(batch=3), controls={"wrenches": 1e-2 * wrench})
+    assert state.outcomes().tolist() == ["converged", "invalid_input", "converged"]
+    state = simulator.step(state)
+    (gradient,) = torch.autograd.grad((state.body_rates[state.differentiable] ** 2).sum(), wrench)
+    assert gradient[1].abs().max() == 0.0
+    torch.testing.assert_close(gradient[0], gradient[2], rtol=0.0, atol=0.0)
+    assert torch.isfinite(gradient).all()
