@@ -21,6 +21,8 @@ from ddg_warp.adjoint.user_force import UserForceAdjoint
 from ddg_warp.kernels.adjoint import coupled_step, elements, time_step
 from ddg_warp.kernels.elements.coupled_element import FRAME, coupled_storage
 from ddg_warp.model.coupled_model import CoupledState
+from ddg_warp.solve.linear.sparse_system import SparseSystem
+from ddg_warp.solve.newton.rigid_bodies import RigidBodies
 
 
 @dataclass
@@ -205,7 +207,9 @@ class CoupledStepAdjoint:
             self._inputs.elements_rate.append(self.contact.grad_inverse_step)
         self.bodies = None
         if coupled.bodies:
-            self.bodies = RigidBodyAdjoint(model, self.solve.system.rigid_bodies, self._shares, self._inputs.damping)
+            bodies = scheme and self.solve.system.rigid_bodies
+            bodies = bodies or RigidBodies(coupled.bodies, SparseSystem(coupled), wp.float64, False, False, False)
+            self.bodies = RigidBodyAdjoint(model, bodies, self._shares, self._inputs.damping, scheme is not None)
             gradients = self.bodies.gradients
             for name in ("moments", "force", "moment"):
                 setattr(self._inputs, name, getattr(gradients, name))
@@ -373,7 +377,7 @@ class CoupledStepAdjoint:
                 shares.uncarry(before, lagged, lagged.q, carried, own_rows, *written)
                 carried, own_rows = carried_first, first
             predictor.vjp(before, grad_q, start, inputs.rate)
-        if self.bodies:
+        if self.bodies and s < np.inf:
             self.bodies.depart(before, solved, carried, own_rows, inputs.data, start, step)
         start.frame, start.lag = carried, own_rows
         if s < np.inf:
@@ -387,7 +391,8 @@ class CoupledStepAdjoint:
         self, solved: CoupledState, rate: float, kept, grad_q: wp.array, w: wp.array, factors: bool
     ) -> None:
         """Write w with rigid bodies, carried nodes included."""
-        self.solve(solved, rate, kept.time, self.bodies.condense(grad_q), w, factors)
+        skew = None if rate else self.bodies.skew(self.solve.tangent, kept.time)
+        self.solve(solved, rate, kept.time, self.bodies.condense(grad_q), w, factors, skew)
         if kept.moment is not None:
             self.bodies.solve(self.solve.system, grad_q, solved, w)
         self.bodies.spread(w)

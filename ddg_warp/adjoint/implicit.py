@@ -217,6 +217,7 @@ class EquilibriumAdjoint:
         check_state("vjp", self.model, cotangent)
         control_values, inputs = checked(controls, self.model, "pull"), []
         self.model.fields.to(state.time, control_values.get("fields"))
+        self.model.drives.to(state.time, state.time, control_values)
         for adjoint in self.parts:
             adjoint.solve.tangent.give(control_values)
             gravity = np.broadcast_to(control_values.get("gravity", self.model.scene.gravity), (self.model.worlds, 3))

@@ -1,8 +1,10 @@
-"""Reverse of rigid bodies in a step of the coupled system; see `ddg_warp.kernels.adjoint.rigid_bodies`."""
+"""Reverse of rigid bodies in steps and equilibria of the coupled system; see `ddg_warp.kernels.adjoint.rigid_bodies`."""
 
 from dataclasses import replace
 
+import numpy as np
 import warp as wp
+from scipy import sparse
 
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.adjoint import rigid_bodies as kernels
@@ -17,20 +19,22 @@ ADDED = "predicted", "momentum", "moments", "rate"  # gradients that kernels add
 
 
 class RigidBodyAdjoint:
-    """Reverse of the rigid bodies of a `CoupledModel` in steps by implicit Euler.
+    """Reverse of the rigid bodies of a `CoupledModel` in steps by implicit Euler and in equilibria.
 
     Args:
         bodies: `RigidBodies` of the exact matrix.
         assembly: `CoupledAssembly`.
         by_damping: gradient by the mass-proportional damping (W N,), added to.
+        steps: True for steps.
 
     Attributes:
         gradients: gradients by the inputs of the bodies, a struct of kernels.
     """
 
-    def __init__(self, model, bodies, assembly, by_damping: wp.array):
+    def __init__(self, model, bodies, assembly, by_damping: wp.array, steps: bool):
         coupled, real = model.coupled, model.types.real
         self.coupled, self.bodies, self.tables, self._assembly = coupled, bodies, coupled.bodies, assembly
+        self._steps = steps
         count, blocks = coupled.worlds * len(self.tables), coupled.worlds * coupled.blocks
 
         def make(size, dtype=coupled.vector):
@@ -59,9 +63,14 @@ class RigidBodyAdjoint:
 
         Args:
             kept: `CoupledSavedStep`; solved: its solution.
-            rate: inverse step [1/s]; coefficient: that of inertia [1/s^2].
+            rate: inverse step [1/s], zero for an equilibrium; coefficient: that of inertia [1/s^2].
         """
         before, islands, tables, struct = kept.before, self._islands, self.tables, self.bodies.bodies
+        if not rate:
+            wp.copy(self.bodies.predicted, solved.rotation)
+            solved = replace(solved, q=wp.clone(solved.q))
+            self.bodies.place(solved, islands)
+            return solved
         islands.inverse_step.fill_(rate)
         islands.inertia_coefficient.fill_(coefficient)
         wp.copy(struct.virial, kept.virial)
@@ -105,7 +114,8 @@ class RigidBodyAdjoint:
         """
         tables = self.tables
         wp.copy(self._q, cotangent.q)
-        wp.copy(self._v, cotangent.v)
+        if self._steps:
+            wp.copy(self._v, cotangent.v)
         inputs = [cotangent.rotation, cotangent.momentum, after.rotation, after.momentum, before.momentum]
         inputs += [self.bodies.predicted, solved.q, tables.moments, tables.arms, tables.starts, tables.carried]
         inputs += [tables.origins, tables.spins, self.coupled.blocks, *step]
@@ -124,6 +134,20 @@ class RigidBodyAdjoint:
         inputs = [self.bodies.bodies.derivative, tables.owner, tables.carried, tables.origins, tables.spins]
         inputs += [self.coupled.blocks]
         wp.launch(self._spread, (self.coupled.worlds, count), inputs, [w], device=self.coupled.device)
+
+    def skew(self, tangent, load_factor: float) -> sparse.csc_matrix | None:
+        """Return the matrix of moments of controls in an equilibrium, which have no potential; None without moments.
+
+        The derivative of T^T M at w = 0 is [M] / 2.
+        """
+        blocks = tangent.carried.bodies
+        moment = load_factor * tangent.given.reshape(-1, 3)[blocks]
+        if not moment.any():
+            return None
+        row, column = np.indices((3, 3)).reshape(2, -1)
+        values = 0.5 * np.cross(moment[:, None], np.eye(3)).reshape(-1, 9)  # of -[M]
+        places = (3 * blocks[:, None] + row).ravel(), (3 * blocks[:, None] + column).ravel()
+        return sparse.csc_matrix((values.ravel(), places), shape=(tangent.size, tangent.size))
 
     def solve(self, system, grad_q: wp.array, solved: CoupledState, w: wp.array) -> None:
         """Correct a solution w of the adjoint system for moments of controls, which have no potential.
@@ -174,9 +198,9 @@ def refuse(model, scheme: str | None) -> None:
     host, first = model.coupled.host, f"body 0 ('{model.scene.bodies[0].name}')"
     contact = host.contact_parameters
     for refused, reason in (
-        (scheme is None, "in equilibrium; gradients go through time steps by 'implicit_euler'"),
+        (scheme is None and contact, "in equilibria with contact; take steps by 'implicit_euler'"),
         (scheme == "implicit_midpoint", "by the implicit midpoint rule; use 'implicit_euler'"),
-        (host.followers, "in a scene with follower loads; leave them out"),
+        (scheme and host.followers, "in a scene with follower loads; leave them out"),
         (
             contact is not None and contact.has_friction and contact.law.friction_iterations > 1,
             "with several friction iterations a step; set friction_iterations=1",

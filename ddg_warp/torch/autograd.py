@@ -9,6 +9,8 @@ from ddg_warp.errors import SceneError
 from ddg_warp.torch.controls import FIELD
 from ddg_warp.torch.grip_poses import by_last_poses
 
+SCALED = "forces", "moments", "field", "torques", "wrenches"  # controls that the load parameter scales
+
 
 @dataclass(frozen=True)
 class Call:
@@ -155,7 +157,7 @@ class Balance(torch.autograd.Function):
                 by_input = engine.tables.vjp(call.parameters, inputs, flags)
                 for name, value in controls.items():
                     by_load = engine.controls.vjp(name, value, inputs, flags)
-                    scaled = name in ("forces", "moments", "field")  # by the load parameter; gravity has been already
+                    scaled = name in SCALED  # gravity has been already
                     if name == "poses" and factor != end:
                         by_load = by_last_poses(engine.poses_of(first), value, fraction, by_load)
                     weight = factor if scaled else fraction if name.startswith(FIELD) else 1.0

@@ -198,10 +198,10 @@ class Case:
             yield self._control("wrenches", 0.1, self._normal(*shape) * size, usual)
         if hinges := len(self.model.drives.joints):
             yield self._control("torques", 1e-3, self._normal(WORLDS, hinges))
-            driven = [joint.angle or 0.0 for joint in self.model.drives.joints]
-            yield replace(
-                self._control("angles", 0.1, self._normal(WORLDS, hinges), self._tensor(driven)), name="hinge angles"
-            )
+            drives = self.model.drives
+            direction = self._normal(WORLDS, hinges) * self._tensor(drives.driven)
+            usual = self._tensor([joint.angle or 0.0 for joint in drives.joints])
+            yield replace(self._control("angles", 0.1, direction, usual), name="hinge angles")
         if not any(joint.first < 0 for joint in self.model.scene.body_joints):  # whose weight is a load
             yield self._control("gravity", 10.0, self._normal(WORLDS, 3) * self.down, gravity)
         if self.model.magnetic:

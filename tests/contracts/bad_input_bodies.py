@@ -170,11 +170,9 @@ if find_spec("torch"):
         poses[..., :3], poses[..., 3] = torch.as_tensor(rotation), poses[..., 3] + shift
         return made.initial_state(body_poses=poses)
 
-    def gradient(*add, rests: bool = False, **options):
+    def gradient(*add, **options):
         made = simulator(*add, **options)
         wrenches = torch.zeros((1, 1, 6), dtype=torch.float64, requires_grad=True)
-        if rests:
-            return made.equilibrium(controls={"wrenches": wrenches}).positions.sum().backward()
         return made.step(made.initial_state(), controls={"wrenches": wrenches}).body_rates.sum().backward()
 
     def stepped(parameter: str):
@@ -183,9 +181,6 @@ if find_spec("torch"):
 
     def follow(scene):
         scene.add_couple(0, -1, (0.0, 0.0, 1e-3))
-
-    def clamp(scene):
-        scene.clamp_end(0, "last")
 
     each("gradients of bodies", "rotation", [2.0 * np.eye(3), np.diag([1.0, 1.0, -1.0])], start, "body_poses: body 0", "R^T R = 1")
     each("gradients of bodies", "rates", [np.zeros(6), np.zeros((2, 6))], lambda v: simulator().initial_state(body_rates=v),
@@ -196,7 +191,6 @@ if find_spec("torch"):
         "the mass of a pinned body": (lambda: stepped("body.mass"), "no object has 'body.mass'", "body.inertia"),
         "the torque as a parameter": (lambda: stepped("hinge.torque"), "hinge.torque drives hinges", "controls={'torques'"),
         "the midpoint rule": (lambda: gradient(scheme="implicit_midpoint"), "body 0 ('ball 0')", "midpoint rule", "use"),
-        "an equilibrium": (lambda: gradient(clamp, rests=True), "body 0 ('ball 0')", "in equilibrium", "'implicit_euler'"),
         "follower loads": (lambda: gradient(follow), "body 0 ('ball 0')", "follower loads", "leave them out"),
         "friction iterations": (lambda: gradient(range=1e-3, friction=0.1, friction_iterations=2), "friction iterations", "set"),
     })
