@@ -142,6 +142,7 @@ def without_gradient(engine) -> str:
     model, parts = engine.model, _parts(engine.model)
     contact = model.coupled and model.coupled.host.contact_parameters
     fixed = [SupportDofs.of(part.host).place for part in parts]
+    bodies = model.coupled and model.coupled.host.rigid_bodies
     refused = {
         "the midpoint rule": engine.midpoint,
         "several friction iterations": bool(contact) and contact.has_friction and contact.law.friction_iterations > 1,
@@ -150,6 +151,11 @@ def without_gradient(engine) -> str:
         and any(model.motions[i] in model.grips for part in model.coupled.sets for i in part.turning[:, 2]),
         "user-defined forces on supports": model.coupled is not None
         and any(np.isin(force.blocks, fixed[-1]).any() for force in model.coupled.user_forces),
+        "supports at an edge that a rigid body clamps": bool(bodies)
+        and any(
+            (np.isin(part.slots, fixed[-1]).any(0) & np.isin(part.slots, bodies.spins).any(0)).any()
+            for part in model.coupled.host.sets
+        ),
         "follower loads on supports": any(
             np.isin(load.places, places).any()
             for part, places in zip(parts, fixed, strict=True)

@@ -179,6 +179,11 @@ if find_spec("torch"):
         made = simulator(pinned=True)
         return made.step(made.initial_state(), {parameter: 1.0})
 
+    def wrenches():
+        made = simulator(lambda scene: scene.clamp(0, edges=[1]))
+        before = made.initial_state()
+        return made.wrenches(before, made.step(before))
+
     def follow(scene):
         scene.add_couple(0, -1, (0.0, 0.0, 1e-3))
 
@@ -192,5 +197,6 @@ if find_spec("torch"):
         "the torque as a parameter": (lambda: stepped("hinge.torque"), "hinge.torque drives hinges", "controls={'torques'"),
         "the midpoint rule": (lambda: gradient(scheme="implicit_midpoint"), "body 0 ('ball 0')", "midpoint rule", "use"),
         "follower loads": (lambda: gradient(follow), "body 0 ('ball 0')", "follower loads", "leave them out"),
+        "wrenches beside a body": (wrenches, "wrenches", "supports at an edge that a rigid body clamps", "Integrator.wrenches"),
         "friction iterations": (lambda: gradient(range=1e-3, friction=0.1, friction_iterations=2), "friction iterations", "set"),
     })
