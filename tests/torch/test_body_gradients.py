@@ -96,3 +96,25 @@ def test_a_world_without_a_finite_wrench_fails_alone(device):
     assert gradient[1].abs().max() == 0.0
     torch.testing.assert_close(gradient[0], gradient[2], rtol=0.0, atol=0.0)
     assert torch.isfinite(gradient).all()
+
+
+def test_a_moment_on_a_body_at_rest(device):
+    """An equilibrium under a moment, which has no potential: a symmetric matrix leaves an error of 2 %."""
+    scene = ddg.Scene()
+    points = torch.linspace(0.0, 0.2, 6)[:, None].numpy() * [1.0, 0.0, 0.0]
+    rod = scene.add_rod(points, section=ddg.Ellipse(4e-3, 3e-3), material=ddg.Material(young=2e6, density=1000.0))
+    scene.clamp(rod)
+    body = scene.add_body(mass=0.01, inertia=(1e-5, 2e-5, 3e-5), center=(0.22, 0.01, 0.0))
+    scene.attach(rod, [-1], body)
+    simulator = Simulator(scene.build(device=device, precision="float64"), 0.01)
+    weights = torch.arange(12.0, dtype=REAL, device=simulator.device).view(3, 4)
+
+    def loss(wrench):
+        state = simulator.equilibrium(controls={"wrenches": wrench[None, None]}, rtol=1e-11)
+        return (state.body_poses[0, 0] * weights).sum()
+
+    wrench = torch.tensor([0.01, 0.02, -0.01, 1e-4, -1e-4, 1e-4], dtype=REAL, device=simulator.device)
+    x = torch.zeros(1, dtype=REAL, device=simulator.device, requires_grad=True)
+    (gradient,) = torch.autograd.grad(loss((1.0 + x) * wrench), x)
+    expected = differences(lambda y: loss((1.0 + y) * wrench).detach(), x.detach(), 0.1)
+    torch.testing.assert_close(gradient, expected, rtol=1e-6, atol=0.0)
