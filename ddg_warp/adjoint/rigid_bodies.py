@@ -12,9 +12,10 @@ from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.rigid_bodies import motion
 from ddg_warp.model.coupled_model import CoupledState
 
-# Solves after the first with moments of controls. Each reduces the error by about half the rotation [rad] that these cause in a step.
-CORRECTIONS = 8
-CHANGED = 1e-6  # largest relative change by the last of them
+# Most solves after the first with moments of controls. Each reduces the error by about half the rotation [rad] that these cause in a
+# step.
+CORRECTIONS = 16
+EXACT, CHANGED = 1e-11, 1e-6  # relative change after which no more follow, and largest one by the last
 ADDED = "predicted", "momentum", "moments", "rate"  # gradients that kernels add to
 
 
@@ -42,6 +43,7 @@ class RigidBodyAdjoint:
 
         self._islands = Islands(coupled.worlds, real, coupled.device)
         self._turned, self._by_turn, self._rhs, self._last, self._q, self._v = (make(blocks) for _ in range(6))
+        self._worlds, self._more = [make(coupled.worlds, int) for _ in range(2)], make(1, int)
         self._lag = coupled.lagged()[1]
         self.gradients = gradients = kernels.gradients_type(real)()
         for name in ("predicted", "momentum", "moments", "force", "moment"):
@@ -50,13 +52,16 @@ class RigidBodyAdjoint:
         self._predict, self._turn = motion.predict_kernel(real, False), motion.turn_kernel(real)
         self._spread = motion.spread_kernel(real, real)
         self._end, self._flight = kernels.end_kernel(real), kernels.flight_kernel(real)
-        self._condense, _, self._correct, self._settle, self._pull = kernels.solve_kernels(real, bodies.linear)
+        self._condense, _, self._correct, self._settle, self._go_on, self._pull = kernels.solve_kernels(
+            real, bodies.linear
+        )
 
     @property
     def kernels(self) -> list:
         """Kernels to load before a capture."""
         around = [self._predict, self._turn, self._spread, self._end, self._flight]
-        return [*around, self._condense, self._correct, self._settle, self._pull, *self.coupled.carries]
+        corrections = [self._correct, self._settle, self._go_on]
+        return [*around, self._condense, *corrections, self._pull, *self.coupled.carries]
 
     def begin(self, kept, solved: CoupledState, rate: float, coefficient: float) -> CoupledState:
         """Move bodies and carried nodes to the solution of a step; return it with the ghosts of its solve.
@@ -154,13 +159,22 @@ class RigidBodyAdjoint:
 
         Marks worlds in `failed` of the `ExactSystem` where the corrections do not converge.
         """
-        blocks, last = self.coupled.blocks, self._last
-        for _ in range(CORRECTIONS):
-            wp.copy(last, w)
+        (marks, left), more = self._worlds, self._more
+        compared = [self.tables.spins, self._last, w, self.coupled.blocks]
+
+        def correct() -> None:
+            more.zero_()
+            wp.copy(self._last, w)
             rhs = self.condense(grad_q)
-            self._launch(self._correct, [self.bodies.bodies, solved.q, w, blocks], [rhs])
+            self._launch(self._correct, [self.bodies.bodies, solved.q, w, self.coupled.blocks], [rhs])
             system.solve_again(rhs, w)
-        self._launch(self._settle, [self.tables.spins, last, w, blocks, CHANGED], [system.failed])
+            self._launch(self._settle, [*compared, EXACT], [marks])
+            wp.launch(self._go_on, len(marks), [marks], [left, more], device=self.coupled.device)
+
+        left.fill_(CORRECTIONS)
+        more.fill_(1)
+        wp.capture_while(more, correct)
+        self._launch(self._settle, [*compared, CHANGED], [system.failed])
 
     def pull(self, solved: CoupledState, w: wp.array, grad_q: wp.array, step) -> None:
         """Add the gradients through the residual; move the gradients by carried nodes to the origins."""

@@ -156,7 +156,8 @@ def solve_kernels(real, linear):
     `condense`: move the gradients by carried nodes to the dofs of their bodies.
     `stiffen`: add the second derivatives of rotations to the matrix; see the module.
     `correct`: add to `out` the component of the matrix at a solution w that has no potential.
-    `settle`: mark worlds where a correction has changed the solution by more than the fraction `missed`.
+    `settle`: mark worlds where a correction has changed the solution by more than a fraction.
+    `go_on`: request another correction for marked worlds, at most `left` of them, and clear the marks.
     `pull`: gradients of the residual by P, moments, controls, rate and damping, and of all nodes by P. Then move the gradients by
     carried nodes to the origins.
     """
@@ -218,13 +219,21 @@ def solve_kernels(real, linear):
         before: wp.array(dtype=V),
         adjoint: wp.array(dtype=V),
         blocks: int,
-        missed: real,
-        failed: wp.array(dtype=int),
+        fraction: real,
+        marks: wp.array(dtype=int),
     ):
         w, b = wp.tid()
         k = spins[b] + w * blocks
-        if not wp.length(adjoint[k] - before[k]) <= missed * wp.length(adjoint[k]):
-            failed[w] = 1
+        if not wp.length(adjoint[k] - before[k]) <= fraction * wp.length(adjoint[k]):
+            marks[w] = 1
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
+    def go_on(marks: wp.array(dtype=int), left: wp.array(dtype=int), more: wp.array(dtype=int)):
+        w = wp.tid()
+        left[w] = left[w] - 1
+        if marks[w] != 0 and left[w] > 0:
+            more[0] = 1
+        marks[w] = 0
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def pull(
@@ -267,7 +276,7 @@ def solve_kernels(real, linear):
         out.rate[i] = out.rate[i] + by_c * (real(2.0) * rate + damping)
         out.damping[k] = out.damping[k] + by_c * rate
 
-    return condense, stiffen, correct, settle, pull
+    return condense, stiffen, correct, settle, go_on, pull
 
 
 @cache
