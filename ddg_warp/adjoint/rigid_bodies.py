@@ -15,7 +15,7 @@ from ddg_warp.model.coupled_model import CoupledState
 # Most solves after the first with moments of controls. Each reduces the error by about half the rotation [rad] that these cause in a
 # step.
 CORRECTIONS = 16
-EXACT, CHANGED = 1e-11, 1e-6  # relative change after which no more follow, and largest one by the last
+EXACT, CHANGED = 1e-9, 1e-6  # relative change after which no more follow, and largest one by the last
 ADDED = "predicted", "momentum", "moments", "rate"  # gradients that kernels add to
 
 
