@@ -40,7 +40,7 @@ def build(count: int, seed: int) -> ddg.Scene:
         turn *= np.sign(np.linalg.det(turn))
         scene.add_body(ddg.Box(center, (0.5 * SIDE,) * 3, rotation=turn, radius=RADIUS), density=500.0, name="boxes")
     scene.add_obstacle(ddg.Plane(), name="floor")
-    scene.contact(friction=0.3, velocity=5e-3, range=0.5e-3)
+    scene.contact(friction=0.3, velocity=5e-3, range=0.5e-3, friction_iterations=1)
     return scene
 
 
