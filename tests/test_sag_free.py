@@ -198,6 +198,13 @@ def test_least_stiffness_is_the_limit_of_stability():
         np.testing.assert_allclose(least_stiffness(softer, softer.state())[0] * factor, least, rtol=1e-6)
 
 
+def with_body(scene) -> None:
+    """Add a clamped rod that carries a body."""
+    rod = scene.add_rod(LEVEL + [0.0, 0.1, 0.0], section=SECTION)
+    scene.clamp(rod)
+    scene.attach(rod, -1, scene.add_body(ddg.Sphere((LENGTH, 0.1, 0.0), 0.01), mass=0.02))
+
+
 REFUSED = {
     "closed": (
         lambda s: s.clamp(s.add_rod(curve(12), section=SECTION, closed=True, name="ring")),
@@ -223,6 +230,7 @@ REFUSED = {
         lambda s: s.fix(s.add_rod(LEVEL, section=SECTION), [0]),
         "no rest strains balance the loads at node 1 of rod 0",
     ),
+    "bodies apart": (lambda s: (with_body(s), s.clamp(s.add_rod(LEVEL, section=SECTION))), "rigid bodies, and other"),
     "free": (lambda s: s.add_rod(LEVEL, section=SECTION), "no rest strains balance the loads at node 0 of rod 0"),
     "chain": (
         lambda s: s.clamp(s.add_rod(LEVEL, section=SECTION, bend=False)),
@@ -238,6 +246,35 @@ def test_scenes_without_such_a_rest_shape_are_refused(name):
     make(scene)
     with pytest.raises(ddg.SceneError, match=f"rest_strains: .*{message}"):
         rest_strains(scene.build("cpu"))
+
+
+def with_payload(mass: float = 0.02, arm: float = 0.05) -> ddg.Scene:
+    """Return a straight cantilever that carries a body at an arm beyond the end."""
+    scene = single_rod(hold="clamp_end")
+    scene.attach(0, -1, scene.add_body(ddg.Box((LENGTH + arm, 0.0, 0.0), (arm, 0.01, 0.01)), mass=mass, name="payload"))
+    return scene
+
+
+def test_a_cantilever_with_a_payload():
+    """k0 = (w (L - s)^2 / 2 + W (L + a - s)) / EI upwards, for a weight W at the arm a; the shape stays, in time, too."""
+    mass, arm = 0.02, 0.05
+    model = with_payload(mass, arm).build("cpu", worlds=2)
+    start, strains = model.state(), rest_strains(model)
+    exact = (0.5 * WEIGHT * (LENGTH - INSIDE) ** 2 + mass * 9.81 * (LENGTH + arm - INSIDE)) / SECTION.EI1
+    natural = strains["rod_bend_twist.rest_1"]
+    assert natural.shape[0] == 2
+    near = np.abs(natural[0][:, None] - exact).min(0)  # elements are numbered by the coupled system
+    np.testing.assert_allclose(near, 0.0, atol=1e-9 * exact.max())
+    with_rest_strains(model, strains)
+    assert np.abs(solve(model).points() - start.points()).max() < 1e-12
+    state, integrator = start, ddg.Integrator(model)
+    for _ in range(5):
+        state = integrator.step(state, 1e-2)
+    assert np.abs(state.points() - start.points()).max() < 1e-12
+    with pytest.raises(ValueError, match="has shape"):
+        set_rest_strains(model, {"rod_stretch.rest": np.ones(3)})
+    with pytest.raises(ddg.SceneError, match=r"least_stiffness: body 0 .*'payload'.* rigid; take"):
+        least_stiffness(model, state)
 
 
 def test_mistakes_are_named():

@@ -326,12 +326,12 @@ class CoupledModel:
         """Return float32 errors of the mixed axial-force formulation for the rods of every world."""
         return self.host.split_errors(self.rod_stiffnesses(s))
 
-    def elements(self, state: CoupledState, index: int, q=None, rate=None):
-        """Return the kernel struct of element set `index` at a state, optionally with other dofs `q` and a rate."""
+    def elements(self, state: CoupledState, index: int, q=None, rate=None, parameters=None):
+        """Return the kernel struct of element set `index` at a state, optionally with other dofs `q`, rate and parameters."""
         part, inputs = self.sets[index], elements.elements_type(self.real)()
         inputs.q, inputs.frame = state.q if q is None else q, state.frame
         inputs.lag, inputs.last, inputs.rate = state.lag[index], state.last[index], self.still if rate is None else rate
-        (inputs.buffer, inputs.table), inputs.slots = part.parameters.arrays, part.slots
+        (inputs.buffer, inputs.table), inputs.slots = (parameters or part.parameters).arrays, part.slots
         inputs.data = state.data.get(index, part.data)
         inputs.blocks, inputs.angle_start, inputs.edges = self.blocks, self.angle_start, self.edges
         inputs.elements = part.elements

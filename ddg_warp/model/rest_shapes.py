@@ -131,12 +131,13 @@ def set_rest(
 
 
 def set_rest_strains(model: Model, strains: Mapping[str, Numbers]) -> None:
-    """Set rest stretches, natural curvatures and natural twists of uncoupled rods, element by element.
+    """Set rest stretches, natural curvatures and natural twists of uncoupled rods, or of rods with rigid bodies, element by element.
 
     Args:
         model: a built scene.
         strains: values (elements,) or (worlds, elements) by name, such as "rod_stretch.rest" [1] or "rod_bend_twist.rest_1" [1/m].
-            Elements are of all rods, rod by rod, clamped ends included. `ddg_warp.postprocess.sag_free.rest_strains` computes some.
+            Elements are of all rods, rod by rod, clamped ends included; with rigid bodies of the whole term, as in `rest_strains`.
+            `ddg_warp.postprocess.sag_free.rest_strains` computes some.
 
     Raises:
         ValueError: no uncoupled rod has such a rest strain, or coupled rods have it too; values do not fit or are not finite.
@@ -144,6 +145,9 @@ def set_rest_strains(model: Model, strains: Mapping[str, Numbers]) -> None:
     """
     check_model("set_rest_strains", model)
     uncoupled = {f"{term.name}.{name}" for group in model.groups for term in group.kind.terms for name in term.rest}
+    if not model.groups and model.scene.bodies:
+        _set_coupled(model, strains)
+        return
     is_coupled = {part.term.name for part in model.coupled.sets} if model.coupled is not None else set()
     allowed, updates = sorted(name for name in uncoupled if name.partition(".")[0] not in is_coupled), []
     if not isinstance(strains, Mapping):
@@ -175,3 +179,22 @@ def set_rest_strains(model: Model, strains: Mapping[str, Numbers]) -> None:
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return scalar products along the last axis."""
     return np.sum(a * b, -1)
+
+
+def _set_coupled(model: Model, strains: Mapping[str, Numbers]) -> None:
+    """Set rest strains of element sets, of a model whose rods all belong to the coupled system."""
+    parts = {f"{part.term.name}.{name}": (part, name) for part in model.coupled.sets for name in part.term.rest}
+    if not isinstance(strains, Mapping) or not strains.keys() <= parts.keys():
+        raise ValueError(
+            f"set_rest_strains: strains are {argument_checks.shown(strains)}; give values by name, of {sorted(parts)}"
+        )
+    updates = []
+    for name, values in strains.items():
+        model.fields.refuse("set_rest_strains", name)
+        (part, parameter), values = parts[name], model.valid_values(*name.rsplit(".", 1), values)
+        if values.shape not in ((part.elements,), (model.worlds, part.elements)):
+            raise ValueError(
+                f"set_rest_strains: {name} has shape {values.shape}; give ({part.elements},) or ({model.worlds}, {part.elements})"
+            )
+        updates.append((part, parameter, values))
+    model.note_change(any([part.set_parameter(parameter, values) for part, parameter, values in updates]))

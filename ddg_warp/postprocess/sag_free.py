@@ -22,9 +22,8 @@ from ddg_warp.capture_lock import launches
 from ddg_warp.errors import SceneError
 from ddg_warp.kernels.densities.quadratic import quadratic
 from ddg_warp.model.model import check_model
-from ddg_warp.model.rigid_bodies import refuse_rigid_bodies
 from ddg_warp.model.state import query
-from ddg_warp.postprocess.element_strains import group_strains
+from ddg_warp.postprocess.element_strains import coupled_strains, group_strains
 from ddg_warp.solve.equilibrium.rigid_modes import rigid_modes
 from ddg_warp.solve.equilibrium.stability import lowest_factors
 from ddg_warp.solve.equilibrium.tangent import Tangent
@@ -43,13 +42,15 @@ def rest_strains(model, state=None, load: float = 1.0) -> dict[str, np.ndarray]:
     Masses stay, as do the measures of elements (drawn lengths), over which curvatures are taken.
 
     Args:
-        model: open uncoupled rods with stretch and with bending and twist, or planar; supports must balance all loads.
+        model: open uncoupled rods with stretch and with bending and twist, or planar; supports must balance all loads. Or rods that
+            all carry rigid bodies, whose weight counts.
         state: the shape to keep; by default the rest state. Velocities are ignored.
         load: the load parameter of statics, which scales gravity and loads.
 
     Returns:
         Values (worlds, elements) by rest strain, such as "rod_stretch.rest" [1] or "rod_bend_twist.rest_1" [1/m]. Elements are
-        numbered rod by rod, clamped ends included.
+        numbered rod by rod, clamped ends included. With rigid bodies the numbers are of the coupled system, and "rigid_joint" has the
+        ends at bodies.
 
     Raises:
         SceneError: a rod is closed, joined, glued or magnetised, has no twist in space, or a law that is not quadratic. Or there are
@@ -60,9 +61,10 @@ def rest_strains(model, state=None, load: float = 1.0) -> dict[str, np.ndarray]:
         query("rest_strains", model, state)
     state, load = state or model.state(), argument_checks.number("rest_strains: load", load)
     _refuse("rest_strains", model)
-    refuse_rigid_bodies("rest_strains", model)
     tangent, result = Tangent(model), {}
     outer = tangent.loads(load, tangent.dofs(state))
+    if model.scene.bodies:
+        return _of_coupled(tangent.parts[-1], state, outer)
     for part in tangent.parts:
         of_group = _of_group(part, state, Tangent.of(part, outer))
         for name, values in of_group.items():
@@ -94,7 +96,10 @@ def least_stiffness(model, state) -> np.ndarray:
     check_model("least_stiffness", model)
     query("least_stiffness", model, state)
     _refuse("least_stiffness", model)
-    refuse_rigid_bodies("least_stiffness", model)
+    if model.scene.bodies:
+        raise SceneError(
+            f"least_stiffness: body 0 ('{model.scene.bodies[0].name}') is rigid; take `stability.spectrum` of a scene with bodies"
+        )
     tangent, result = Tangent(model), np.zeros((model.worlds, model.scene.rod_count))
     forces = [_Elements.of(part, state).forces for part in tangent.parts]
     strained = sparse.block_diag([unit @ unit.T for unit in forces], format="csr")
@@ -121,14 +126,18 @@ def _refuse(call: str, model) -> None:
     scene, start = model.scene, f"{call}: "
     if model.precision == "float32":
         raise SceneError(f"{start}float32 leaves too little of forces; build the model in 'mixed' or 'float64'")
-    if model.coupled is not None:
+    if model.coupled is not None and not _carries_bodies_alone(model):
         host, body = model.coupled.host, "a shell of revolution"
-        if host.rods:
+        if scene.bodies:
+            body = "rigid bodies, and other objects or joints"
+        elif host.rods:
             rod = min(each.rod for each in host.rods)
             body = f"rod {rod} ('{model.curves.names[rod]}'), which is joined, attached to a shell or magnetised"
         elif scene.shells:
             body = f"shell 0 ('{scene.shells[0].name}')"
-        raise SceneError(f"{start}the scene has {body}; sag-free rest strains need a scene of uncoupled rods")
+        raise SceneError(
+            f"{start}the scene has {body}; sag-free rest strains need a scene of uncoupled rods, or of rods that all carry bodies"
+        )
     for group in model.groups:
         rod = int(group.host.rods[0])
         named = f"{start}rod {rod} ('{model.curves.names[rod]}')"
@@ -143,6 +152,16 @@ def _refuse(call: str, model) -> None:
                 raise SceneError(
                     f"{named} has no twist, and so no natural curvature that rotates with it; add it with twist=True"
                 )
+
+
+def _carries_bodies_alone(model) -> bool:
+    """Return True if all rods carry rigid bodies, and nothing else has energy."""
+    parts = model.coupled.sets
+    quadratic_rods = all(
+        part.term.rest and (part.term.density.undamped or part.term.density) is quadratic for part in parts
+    )
+    rest_of_scene = model.groups or model.scene.shells or model.scene.joints or model.scene.body_joints or model.touch
+    return bool(model.scene.bodies and quadratic_rods and not rest_of_scene)
 
 
 @dataclass(frozen=True)
@@ -181,16 +200,45 @@ def _of_group(part, state, outer: np.ndarray) -> dict[str, np.ndarray]:
     """Return rest strains by name (n, columns) of a rod group under external forces (size,)."""
     elements = _Elements.of(part, state)
     scaled_stress = shortest(elements.forces[part.free], outer[part.free])
-    inner = elements.forces @ scaled_stress
+    _refuse_unbalanced(part, outer, elements.forces @ scaled_stress)
+    root = np.sqrt(elements.stiffness * elements.measures)
+    beyond = _over(scaled_stress.reshape(elements.strains.T.shape).T, root)
+    return dict(zip(elements.names, elements.strains - beyond, strict=True))
+
+
+def _of_coupled(part, state, outer: np.ndarray) -> dict[str, np.ndarray]:
+    """Return rest strains by name (worlds, elements) of rods with rigid bodies under external forces (size,)."""
+    from scipy import sparse
+
+    forces, roots, strains = [], [], []
+    for index, elements in enumerate(part.coupled.sets):
+        values = coupled_strains(part.coupled, state, index)[0]
+        each = [np.broadcast_to(elements.parameters[name], values.shape[1:]) for name in elements.term.stiffness]
+        measure = np.broadcast_to(elements.parameters["measure"], values.shape[1:])
+        scale = np.sqrt(_over(np.stack(each), np.broadcast_to(measure, values.shape)))
+        forces.append(part.unit_forces(state, index, values) @ sparse.diags(scale.ravel()))
+        roots.append(np.sqrt(np.stack(each) * measure))
+        strains.append(values)
+    forces = sparse.hstack(forces, format="csr")
+    scaled_stress = shortest(forces[part.free], outer[part.free])
+    _refuse_unbalanced(part, outer, forces @ scaled_stress)
+    result, first = {}, 0
+    for elements, root, values in zip(part.coupled.sets, roots, strains, strict=True):
+        beyond = _over(scaled_stress[first : first + root.size].reshape(root.shape), root)
+        first += root.size
+        for name, rest in zip(elements.term.rest, values - beyond, strict=True):
+            result[f"{elements.term.name}.{name}"] = rest
+    return result
+
+
+def _refuse_unbalanced(part, outer: np.ndarray, inner: np.ndarray) -> None:
+    """Refuse external forces that internal forces (size,) do not balance on free dofs."""
     allowed = RTOL * part.allowed(part.body_loads(outer, inner))
     for dof in np.flatnonzero(part.free & ~(np.abs(outer - inner) <= allowed))[:1]:
         raise SceneError(
             f"rest_strains: no rest strains balance the loads at {part.where(dof)}; clamp an edge of the rod, or support "
             "more of it"
         )
-    root = np.sqrt(elements.stiffness * elements.measures)
-    beyond = _over(scaled_stress.reshape(elements.strains.T.shape).T, root)
-    return dict(zip(elements.names, elements.strains - beyond, strict=True))
 
 
 def _over(values: np.ndarray, divisors: np.ndarray) -> np.ndarray:

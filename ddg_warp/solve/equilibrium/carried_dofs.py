@@ -60,11 +60,16 @@ class CarriedDofs:
 
     def matrix(self, q: np.ndarray, values: sparse.csc_matrix) -> sparse.csc_matrix:
         """Return P^T K P of a matrix (size, size)."""
-        y = self.arms(q)
+        projection = self.projection(q)
+        return sparse.csc_matrix(projection.T @ values @ projection)
+
+    def projection(self, q: np.ndarray) -> sparse.csc_matrix:
+        """Return P (size, size), the displacements of nodes by dofs."""
+        y, shape = self.arms(q), (self._size, self._size)
         identity = sparse.diags(self._free.astype(float))
         rows = 3 * np.repeat(self.carried, 3) + np.tile(np.arange(3), len(self.carried))
         columns = 3 * np.repeat(self.origins, 3) + np.tile(np.arange(3), len(self.carried))
-        along = sparse.csc_matrix((np.ones(len(rows)), (rows, columns)), shape=values.shape)
+        along = sparse.csc_matrix((np.ones(len(rows)), (rows, columns)), shape=shape)
         crossed = _crosses(y)
         row, column = np.indices((3, 3)).reshape(2, -1)
         turns = sparse.csc_matrix(
@@ -72,10 +77,9 @@ class CarriedDofs:
                 -crossed.reshape(-1, 9).ravel(),
                 ((3 * self.carried[:, None] + row).ravel(), (3 * self.spins[:, None] + column).ravel()),
             ),
-            shape=values.shape,
+            shape=shape,
         )
-        projection = (identity + along + turns).tocsc()
-        return sparse.csc_matrix(projection.T @ values @ projection)
+        return (identity + along + turns).tocsc()
 
     def geometric(self, q: np.ndarray, gradient: np.ndarray) -> sparse.csc_matrix:
         """Return the geometric stiffness of energy gradients (size,) on carried nodes."""

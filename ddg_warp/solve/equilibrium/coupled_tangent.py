@@ -12,6 +12,7 @@ from ddg_warp.kernels.core.islands import Islands
 from ddg_warp.kernels.elements import element_path
 from ddg_warp.kernels.elements.coupled_element import coupled_storage, linear_stress_kernel
 from ddg_warp.model import validate
+from ddg_warp.model.parameters import ParameterTable
 from ddg_warp.scene.grip import Grip
 from ddg_warp.solve.collision import exact_hessian
 from ddg_warp.solve.equilibrium.carried_dofs import CarriedDofs
@@ -162,13 +163,32 @@ class CoupledTangent(TangentBlock):
     def matrix(self, values: sparse.csc_matrix) -> sparse.csc_matrix:
         return self.planes.matrix(values) if self.planes else values
 
-    def forces(self, state, index: int) -> np.ndarray:
-        """Return the energy derivatives of a set's elements by blocks (local nodes, elements, 3)."""
+    def forces(self, state, index: int, parameters: ParameterTable | None = None) -> np.ndarray:
+        """Return the energy derivatives of a set's elements by blocks (local nodes, elements, 3), for other parameters if given."""
         part = self.coupled.sets[index]
         shape = (len(part.host.slots), part.elements * self.coupled.worlds)
         out = wp.zeros(shape, dtype=self.coupled.vector, device=self.coupled.device)
-        self._launch(state, index, 1, out, ())
+        self._launch(state, index, 1, out, (), parameters=parameters)
         return out.numpy().astype(np.float64)
+
+    def unit_forces(self, state, index: int, strains: np.ndarray) -> sparse.csr_matrix:
+        """Return the derivatives of the strains of a set by the dofs, times the measures: forces of unit stresses (size, strains W E).
+
+        Args:
+            strains: at this state, with a quadratic law (strains, worlds, elements).
+        """
+        part, columns = self.coupled.sets[index], []
+        dofs = 3 * _tiled(part.host.slots, self.host.blocks, self.worlds)[..., None] + np.arange(3)
+        for unit in range(len(part.term.rest)):
+            values = {name: np.full((1, 1), float(m == unit)) for m, name in enumerate(part.term.stiffness)}
+            values |= {name: strains[m] - 1.0 for m, name in enumerate(part.term.rest)}
+            table = ParameterTable(part.parameters.values | values, 1, self.coupled.real, self.coupled.device)
+            forces = self.forces(state, index, table).transpose(1, 0, 2)
+            element = np.broadcast_to(np.arange(len(forces))[:, None, None], forces.shape)
+            entries = forces.ravel(), (dofs.transpose(1, 0, 2).ravel(), element.ravel())
+            columns.append(sparse.csr_matrix(entries, shape=(self.size, len(forces))))
+        result = sparse.hstack(columns, format="csr")
+        return self.carried.projection(self.dofs(state)).T @ result if self.carried else result
 
     def hessian(self, state, stress: list | None = None) -> sparse.csc_matrix:
         validate.refuse_friction(self.model)
@@ -411,12 +431,21 @@ class CoupledTangent(TangentBlock):
                 return f"a node of body {rigid.owner[np.argmax(rigid.carried == block)]}"
         return f"joint {block - self.host.nodes - self.host.angles}"
 
-    def _launch(self, state, index: int, kernel: int, out: wp.array, columns: tuple, *more) -> None:
+    def _launch(
+        self,
+        state,
+        index: int,
+        kernel: int,
+        out: wp.array,
+        columns: tuple,
+        *more,
+        parameters: ParameterTable | None = None,
+    ) -> None:
         part, real = self.coupled.sets[index], self.coupled.real
         wp.launch(
             element_path.term_kernels(coupled_storage(part.term, real), 0, real)[kernel],
             (self.coupled.worlds, part.elements, *columns),
-            [self.coupled.elements(state.coupled, index, rate=self.rate), *more],
+            [self.coupled.elements(state.coupled, index, rate=self.rate, parameters=parameters), *more],
             [out],
             device=self.coupled.device,
         )
