@@ -38,7 +38,7 @@ ARC = 0.1  # rotation in a substep that is resolved [rad]
 # Tolerated energy that contact creates, over the energy of the rotation: of a body alone, and at most of one among many, which lose
 # more.
 CREATED, MOST = 0.01, 0.1
-SHORTEST = 1.0 / 16.0  # fraction of a step from which on substeps are accepted
+SHORTEST = 1.0 / 16.0  # fraction of a step from which on substeps are accepted, if retries get there
 
 
 @cache
@@ -60,13 +60,14 @@ def refuse_kernel(real):
         target: wp.array(dtype=V),
         mass: wp.array2d(dtype=V),
         push: wp.array(dtype=V),
+        shortest: real,
         flags: wp.array2d(dtype=int),
         scalars: wp.array2d(dtype=real),
     ):
         w, b = wp.tid()
         if flags[SUBSTEP_ACCEPTED, w] == 0 or flags[STATUS, w] > wp.static(outcome.CONVERGED_TO_ROUNDING):
             return
-        if scalars[SUBSTEP_FRACTION, w] <= real(wp.static(SHORTEST)) * scalars[SUBSTEP, w]:
+        if scalars[SUBSTEP_FRACTION, w] <= shortest * scalars[SUBSTEP, w]:
             return
         blocks, carried, i = mass.shape[1], w * bodies.carried.shape[0], b + w * bodies.origins.shape[0]
         rate, coefficient = scalars[INVERSE_STEP, w], scalars[INERTIA_COEFFICIENT, w]

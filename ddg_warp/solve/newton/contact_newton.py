@@ -166,10 +166,13 @@ class NewtonContact:
         self.pending.arrive(iterates, system, islands, self.limit.modes)
 
     @timer("interpenetration check")
-    def finish(self, before, iterates, islands) -> None:
-        """Refuse substeps from the coupled state `before` with interpenetration, or with energy created by rotating bodies."""
+    def finish(self, before, iterates, islands, smallest: float) -> None:
+        """Refuse substeps from the coupled state `before` with interpenetration, or with energy created by rotating bodies.
+
+        `smallest`: fraction of a step that retries reach.
+        """
         if self.rigid_bodies:
-            self.rigid_bodies.refuse(before, iterates, self.terms.forces, islands)
+            self.rigid_bodies.refuse(before, iterates, self.terms.forces, islands, smallest)
         self.search.check_crossings(before.q, iterates.q)
         inputs = [self.search.crossed, self.terms.gap, self.search.counters.overflow, *islands.arrays]
         self._launch(self._refuse, inputs, [self.tally.crossed, self.tally.least])

@@ -127,11 +127,14 @@ class RigidBodies:
         inputs = [start, *bodies, together, fractions, self.least]
         wp.launch(self._shorten, (worlds, self.coupled.blocks), inputs, [q], device=self.coupled.device)
 
-    def refuse(self, before, iterates, push: wp.array, islands) -> None:
-        """Reject substeps from a coupled state where contact forces `push` (W N,) on rotating bodies create energy."""
-        tables = self.tables
+    def refuse(self, before, iterates, push: wp.array, islands, smallest: float) -> None:
+        """Reject substeps from a coupled state where contact forces `push` (W N,) on rotating bodies create energy.
+
+        `smallest`: fraction of a step that retries reach.
+        """
+        tables, shortest = self.tables, max(contact_energy.SHORTEST, smallest)
         inputs = [before.rotation, before.momentum, tables.moments, self.predicted, tables.arms, self.bodies]
-        inputs += [iterates.q, iterates.target, self.coupled.mass, push]
+        inputs += [iterates.q, iterates.target, self.coupled.mass, push, shortest]
         self._launch(self._refuse, len(tables), inputs, [*islands.arrays])
 
     def note_fractions(self, time: wp.array) -> None:

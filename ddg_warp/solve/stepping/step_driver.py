@@ -174,13 +174,17 @@ class StepDriver:
         self.attempt(before, after)
         self._decide_retry()
 
+    @property
+    def _smallest(self) -> float:
+        """Smallest fraction of a step that retries reach."""
+        return 0.5 ** (self.integrator.retry_limit // 2)
+
     @timer("retry test")
     def _decide_retry(self) -> None:
         """Launch the retry logic."""
         self.remaining.zero_()
-        limit = self.integrator.retry_limit
         threads = device_arrays.takers(min(len(self.islands), COUNTING), self.model.wp_device)
-        inputs = [threads, *self.islands.arrays, limit, 0.5 ** (limit // 2), self.rounded]
+        inputs = [threads, *self.islands.arrays, self.integrator.retry_limit, self._smallest, self.rounded]
         self._launch(self._advance, threads, inputs, [self.tally, self.work, self.remaining])
 
     def attempt(self, before, after) -> None:
@@ -212,7 +216,7 @@ class StepDriver:
             contact.lag_again(solution, newton.iterates, self.islands)
             self.solve(start)
         if contact:
-            contact.finish(before, newton.iterates, self.islands)  # interpenetration check
+            contact.finish(before, newton.iterates, self.islands, self._smallest)  # interpenetration check
         if self.energy:
             self.energy.check_drift(before, start)
         with timer("finish"):  # positions, velocities and accelerations of accepted substeps
