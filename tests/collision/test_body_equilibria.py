@@ -146,6 +146,27 @@ def test_friction_holds_a_box_on_an_incline(device, mu):
     np.testing.assert_allclose(state.body("box").rotation, np.eye(3), atol=2e-3)
 
 
+def test_ladder_stands_above_its_critical_angle(device):
+    """A ladder at a wall stands above tan(angle) = (1 - mu^2) / (2 mu), near which both ends are about to slide."""
+    mu, r, length, scene = 0.4, 2e-3, 0.3, ddg.Scene()
+    angle, gap = 1.01 * np.arctan((1.0 - mu**2) / (2.0 * mu)), r + 4.5e-4
+    rails = [
+        ddg.Capsule((gap + length * np.cos(angle), y, gap), (gap, y, gap + length * np.sin(angle)), r)
+        for y in (-0.1, 0.1)
+    ]
+    scene.add_body(rails, density=DENSITY, name="ladder")
+    scene.add_obstacle(ddg.Plane(), name="floor")
+    scene.add_obstacle(ddg.Plane(normal=(1.0, 0.0, 0.0)), name="wall")
+    scene.contact(range=5e-4, friction=mu)
+    model = scene.build(device)
+    state = statics.solve(model)
+    np.testing.assert_allclose(state.body(0).position, model.state().body(0).position, atol=2e-3)
+    floor, wall = (-forces_on(model, state, name).sum(0) for name in ("floor", "wall"))
+    np.testing.assert_allclose(floor + wall, [0.0, 0.0, scene.bodies[0].mass * G], atol=1e-6)
+    assert 0.95 * mu < -floor[0] / floor[2] < mu
+    assert 0.95 * mu < wall[2] / wall[0] < mu
+
+
 def test_body_adrift_is_named(device):
     """A floor carries one of two bodies, and the other falls."""
     scene = ddg.Scene()
