@@ -56,7 +56,8 @@ class FrictionSet(CollisionSet):
             neighbours = self._upload(shapes.beside(candidates.first.size))
         self.directions = neighbours, coefficients
         self.angles = [self._upload(each) if self.rolls else None for each in angles]
-        self._body_rotations = wp.array(rotations.astype(np.int32), dtype=int, device=self.device)
+        rotations = rotations.astype(np.int32) if self.rotates else np.zeros(0, np.int32)
+        self._body_rotations = wp.array(rotations, dtype=int, device=self.device)
         self.kernels += [self._lag, self._evaluate]
         self._onward = 0
         self._kept = ("count", "starts", "partners")
