@@ -118,10 +118,17 @@ def groom_scene(
         SceneError: an invalid value; names group or strand.
         CurveError: a primvar is missing.
     """
-    contact, self_contact = (
-        argument_checks.flag(f"groom: {name}", value)
-        for name, value in (("contact", contact and skin is not None), ("self_contact", self_contact))
-    )
+    from ddg_warp.io.usd_groom import Groom
+
+    if not isinstance(groom, Groom):
+        raise SceneError(f"groom_scene: groom is {argument_checks.shown(groom)}; give the result of ddg.usd.open_groom")
+    if skin is not None and not isinstance(skin, AnimatedMesh):
+        raise SceneError(
+            f"groom_scene: skin is {argument_checks.shown(skin)}; give an AnimatedMesh, as ddg.usd.read_animated_mesh returns"
+        )
+    flags = {"contact": contact, "self_contact": self_contact, "sag_free": sag_free}
+    contact, self_contact, sag_free = (argument_checks.flag(f"groom: {name}", value) for name, value in flags.items())
+    contact = contact and skin is not None
     groups = (groom.groups if group is None else groom.of_strands(group)).astype(str)
     strands = np.lexsort((groom.counts, groom.closed, groups))
     points, stops = groom.rods(), np.cumsum(groom.counts)
@@ -219,6 +226,10 @@ def simulate_groom(
         CurveError, MeshError, SceneError: see `ddg.usd.open_groom`, `ddg.usd.read_animated_mesh` and `groom_scene`.
         SolverError: a step fails.
     """
+    for name in options:
+        if name not in (valid := argument_checks.names(groom_scene)[2:]):
+            near = argument_checks.meant(name, [*valid, *argument_checks.names(simulate_groom)])
+            raise SceneError(f"simulate_groom takes no {name!r}{near}")
     from ddg_warp.io.usd_animated_mesh import read_animated_mesh
     from ddg_warp.io.usd_groom import open_groom
     from ddg_warp.io.usd_groom_layer import GroomLayer

@@ -16,7 +16,7 @@ from ddg_warp.io.dismech import read_rods
 from ddg_warp.io.mesh_read import read_mesh
 from ddg_warp.io.paths import existing
 from ddg_warp.io.surface_of_revolution import Revolution
-from ddg_warp.io.usd import read_curves, validate
+from ddg_warp.io.usd import open_groom, read_animated_mesh, read_curves, validate
 from ddg_warp.io.usd_prims import ColorBy
 
 
@@ -38,6 +38,8 @@ for kind_of_file, reader in {
     "a mesh": read_mesh,
     "DisMech": read_rods,
     "USD": validate,
+    "a groom": open_groom,
+    "an animated mesh": read_animated_mesh,
 }.items():
     each("paths", kind_of_file, NO_PATHS, reader, "the file to read", "pathlib.Path")
 refuse(
