@@ -131,38 +131,25 @@ def groom_scene(
     contact = contact and skin is not None
     groups = (groom.groups if group is None else groom.of_strands(group)).astype(str)
     strands = np.lexsort((groom.counts, groom.closed, groups))
-    points, stops = groom.rods(), np.cumsum(groom.counts)
     radius = _along(groom, "radius", groom.radius if radius is None else radius, groups)
     young = _along(groom, "young", young, groups)
-    bends = [
-        None if value is None else _along(groom, name, value, groups)
+    natural = {
+        name: _along(groom, name, 0.0 if value is None else value, groups)
         for name, value in (("curl", curl), ("twist", twist))
-    ]
-    scene = Scene(mass_damping=damping)
-    rods, chunks = [], _chunks(strands, groups, groom)
-    rest = _sag_free(groom, chunks, strands, young, radius, density, poisson) if sag_free else [{}] * len(chunks)
+    }
+    drawn = curl is None and twist is None
+    if sag_free and not drawn:
+        raise SceneError("groom: sag_free finds natural curvature and twist; leave out sag_free, or curl and twist")
+    scene, rods, chunks = Scene(mass_damping=damping), [], _chunks(strands, groups, groom)
+    bodies = {"young": young, "radius": radius, "density": density, "poisson": poisson}
+    rest = _sag_free(groom, chunks, **bodies) if sag_free else [{}] * len(chunks)
     for chunk, more in zip(chunks, rest, strict=True):
-        rows = np.stack([np.arange(stops[k] - groom.counts[k], stops[k]) for k in chunk])
-        closed = bool(groom.closed[chunk[0]])
-        if any(each is not None for each in bends):
-            inner = rows if closed else rows[:, 1:-1]
-            more = {
-                "natural": [0.0 * inner if each is None else each[inner] for each in (bends[0], None, bends[1])],
-                **more,
-            }
-        rods += _add(
-            scene,
-            np.stack([points[k] for k in chunk]),
-            rows,
-            closed,
-            young,
-            radius,
-            density,
-            poisson,
-            groups[chunk[0]],
-            more,
-        )
-    _hold(scene, rods, np.stack([points[k][0] for k in strands]), groom, strands, skin)
+        if not drawn:
+            inner = _nodes(groom, chunk)[:, slice(None) if groom.closed[chunk[0]] else slice(1, -1)]
+            more = {"natural": [natural["curl"][inner], 0.0 * inner, natural["twist"][inner]]}
+        rods += _add(scene, groom, chunk, **bodies, name=groups[chunk[0]], **more)
+    first = np.cumsum(groom.counts) - groom.counts
+    _hold(scene, rods, groom.points[first[strands]], groom, strands, skin)
     lengths = {}
     if contact or self_contact:
         scene.contact(friction=friction)
@@ -186,8 +173,7 @@ def groom_scene(
                     scene.contact_between(name, partner, ignore=True)
     starts = np.empty(len(strands), int)
     starts[strands] = np.cumsum(groom.counts[strands]) - groom.counts[strands]
-    first = np.repeat(stops - groom.counts, groom.counts)
-    nodes = np.arange(len(groom.points)) - first + np.repeat(starts, groom.counts)
+    nodes = np.arange(len(groom.points)) + np.repeat(starts - first, groom.counts)
     return GroomScene(scene, strands, nodes, lengths)
 
 
@@ -290,20 +276,27 @@ def _chunks(strands: Integers, groups: np.ndarray, groom: Groom) -> list[Integer
     return np.split(strands, cuts)
 
 
-def _add(scene: Scene, points, rows, closed: bool, young, radius, density, poisson, name: str, more: dict) -> list:
-    """Add strands (R, n, 3), whose nodes have values at `rows` (R, n), and return the rods."""
+def _nodes(groom: Groom, chunk: Integers) -> Integers:
+    """Return the nodes of strands of one number of nodes (R, n)."""
+    count = groom.counts[chunk[0]]
+    return (np.cumsum(groom.counts)[chunk] - count)[:, None] + np.arange(count)
+
+
+def _add(scene: Scene, groom: Groom, chunk: Integers, *, young, radius, density, poisson, name: str, **more) -> list:
+    """Add strands of one number of nodes and one kind, and return the rods."""
+    nodes, closed = _nodes(groom, chunk), bool(groom.closed[chunk[0]])
 
     def at_edges(values):
-        following = np.roll(values, -1, axis=1)
-        return 0.5 * (values + following) if closed else 0.5 * (values + following)[:, :-1]
+        mean = 0.5 * (values[nodes] + np.roll(values[nodes], -1, axis=1))
+        return mean if closed else mean[:, :-1]
 
-    material = Material(at_edges(young[rows]), poisson=poisson, density=density)
-    bend = closed or points.shape[1] > 2
-    section = Circle(at_edges(radius[rows]))
-    return list(scene.add_rods(points, section=section, material=material, closed=closed, bend=bend, name=name, **more))
+    material = Material(at_edges(young), poisson=poisson, density=density)
+    bend = closed or nodes.shape[1] > 2
+    more = {"material": material, "closed": closed, "bend": bend, "name": name, **more}
+    return list(scene.add_rods(groom.points[nodes], section=Circle(at_edges(radius)), **more))
 
 
-def _sag_free(groom: Groom, chunks, strands, young, radius, density, poisson) -> list[dict]:
+def _sag_free(groom: Groom, chunks: list[Integers], **bodies) -> list[dict]:
     """Return natural shapes and laws of rods by chunk, with which clamped strands hang as drawn."""
     from ddg_warp.postprocess.sag_free import rest_strains
 
@@ -312,13 +305,9 @@ def _sag_free(groom: Groom, chunks, strands, young, radius, density, poisson) ->
         raise SceneError(
             f"groom: sag_free is for open strands of 3 nodes or more, and strand {strand} is none; leave it out"
         )
-    scene, stops, points = Scene(), np.cumsum(groom.counts), groom.rods()
+    scene = Scene()
     for chunk in chunks:
-        rows = np.stack([np.arange(stops[k] - groom.counts[k], stops[k]) for k in chunk])
-        rods = _add(
-            scene, np.stack([points[k] for k in chunk]), rows, False, young, radius, density, poisson, "strands", {}
-        )
-        scene.clamp(rods)
+        scene.clamp(_add(scene, groom, chunk, **bodies, name="strands"))
     result, edge, vertex = [], 0, 0
     *natural, stretch = (values[0] for values in rest_strains(scene.build("cpu", "float64")).values())
     for chunk in chunks:

@@ -69,6 +69,7 @@ each("grooms", "frames", [-1, 1.5, "all"], lambda v: run(frames=v), "frames", "w
 refuse("grooms", {
     "no value for a group": (lambda: described(group="clump_id", young={99: 1e9}), "young has no value for group", "'99'"),
     "group by no primvar": (lambda: described(group="side"), "no primvar 'side'", "clump_id, st"),
+    "sag-free curls": (lambda: described(curl=1.0, sag_free=True), "sag_free finds natural curvature", "leave out"),
     "nearly young": (lambda: run(yong=1e9), "simulate_groom takes no 'yong'", "did you mean 'young'"),
     "a skin that is no mesh": (lambda: run(skin="/char/hair"), "0 meshes to read"),
     "a layer over itself": (lambda: ddg.usd.GroomLayer(groom(), stage()), "is the groom itself", "another file"),

@@ -197,9 +197,8 @@ class CollisionMesh:
     def _arc_lengths(self, keys: np.ndarray) -> np.ndarray:
         """Return the arc lengths [m] of nodes of edges, by keys: object times all nodes + node; infinite for nodes of no edge."""
         ends, _, owners, span = self.primitives(2)
-        every = (owners * len(self.points) + ends.T)[
-            ::-1
-        ].ravel()  # of a node of two edges the start of the second counts
+        # second ends first: of a node of two edges the start of the second edge counts
+        every = (owners * len(self.points) + ends.T)[::-1].ravel()
         order = np.argsort(every, kind="stable")
         index = np.searchsorted(every[order], keys, side="right") - 1
         match = (index >= 0) & (every[order][index] == keys)
