@@ -11,7 +11,7 @@ import numpy as np
 
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError, SolverError
-from ddg_warp.scene.field import Field, Samples
+from ddg_warp.scene.field import Field
 from ddg_warp.typing import Floats, Numbers, Vector
 
 CHUNK = 2**12  # points whose modes are summed at once
@@ -138,7 +138,13 @@ class FlowGrid(Flow):
         object.__setattr__(self, "lower", lower)
         object.__setattr__(self, "upper", upper)
         if not steady:
-            object.__setattr__(self, "times", Samples(values, self.times).times)
+            times = argument_checks.array(
+                "FlowGrid: times", self.times, f"give ascending numbers ({len(values)},)"
+            ).copy()
+            if times.shape != values.shape[:1] or not np.isfinite(times).all() or (np.diff(times) <= 0.0).any():
+                shown = argument_checks.shown(times)
+                raise SceneError(f"FlowGrid: times are {shown}; give ascending numbers ({len(values)},), one a grid")
+            object.__setattr__(self, "times", times)
 
     def __call__(self, points: Floats, t: float) -> Floats:
         """Return velocities at points (..., 3)."""

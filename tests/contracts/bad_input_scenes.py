@@ -65,7 +65,7 @@ refuse("scene", {
     "flow that is added": (lambda: ddg.Gust((6.0, 0.0, 0.0)) + 3.0, "flow that is added", "three finite numbers"),
     "grid of points": (lambda: ddg.FlowGrid(np.zeros((4, 3)), (0, 0, 0), (1, 1, 1)), "(4, 3)", "(nx, ny, nz, 3)"),
     "grid in time": (lambda: ddg.FlowGrid(np.zeros((2, 2, 2, 3)), (0, 0, 0), (1, 1, 1), [0.0, 1.0]), "(times, nx, ny, nz, 3)"),
-    "grid at times": (lambda: ddg.FlowGrid(np.zeros((2, 2, 2, 2, 3)), (0, 0, 0), (1, 1, 1), [1.0, 0.0]), "times", "ascending"),
+    "grid at times": (lambda: ddg.FlowGrid(np.zeros((2, 2, 2, 2, 3)), (0, 0, 0), (1, 1, 1), [1.0, 0.0]), "FlowGrid: times are"),
     "grid nan": (lambda: ddg.FlowGrid(np.full((2, 2, 2, 3), NAN), (0, 0, 0), (1, 1, 1)), "velocities", "not all finite"),
     "grid upside down": (lambda: ddg.FlowGrid(np.zeros((2, 2, 2, 3)), (0, 0, 0), (1, -1, 1)), "upper is -1 along y", "larger"),
 })
