@@ -21,6 +21,11 @@ from ddg_warp.io.paths import MeshError, shown
 MESHIO = {".ply": "ply", ".msh": "gmsh", ".vtk": "vtk", ".vtu": "vtu", ".inp": "abaqus"}
 PLANE = ("triangle", "quad", "polygon")
 TEXTURE = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"))  # properties of PLY vertices
+# announced sizes, for which meshio reads on or takes memory without end
+COUNTS = {"ply": re.compile(rb"^(element \w+) +(\d+)", re.MULTILINE)}
+COUNTS["vtk"] = re.compile(
+    rb"^(POINTS|CELLS|CELL_TYPES|POINT_DATA|CELL_DATA|OFFSETS|CONNECTIVITY)\s+(\d+)", re.MULTILINE
+)
 LISTED = 5
 GLB_HEADER = 20  # bytes: magic, version, length, length and kind of the first chunk
 GLB_UNREAD = ("animations", "skins", "cameras", "materials", "images")
@@ -86,8 +91,13 @@ def read_by_meshio(path: Path) -> FileMesh:
 
     Triangles, quads and polygons are read. Other elements, fields and sets are listed as unread.
     """
-    kind = MESHIO[path.suffix.lower()]
-    if kind == "abaqus" and re.search(rb"^\s*\*include", path.read_bytes(), re.IGNORECASE | re.MULTILINE):
+    kind, content = MESHIO[path.suffix.lower()], path.read_bytes()
+    if kind == "ply" and b"end_header" not in content:
+        raise _damaged(path, "the header has no end")
+    for line, number in COUNTS[kind].findall(content) if kind in COUNTS else ():
+        if int(number) > len(content):
+            raise _damaged(path, f"{line.decode(errors='replace')} {int(number)} elements in {len(content)} bytes")
+    if kind == "abaqus" and re.search(rb"^\s*\*include", content, re.IGNORECASE | re.MULTILINE):
         raise MeshError(f"{path}: the file includes other files (*INCLUDE), which are not read; join them to one file")
     with _library(path, "meshio"):
         import importlib
@@ -187,7 +197,7 @@ def _library(path: Path, name: str) -> Iterator[None]:
         raise _damaged(path, error) from error
 
 
-def _damaged(path: Path, error: BaseException) -> MeshError:
+def _damaged(path: Path, error: BaseException | str) -> MeshError:
     text = shown(str(error).split()) or type(error).__name__
     return MeshError(
         f"{path}: this is no {path.suffix[1:].upper()} file, or it is cut short or damaged ({text}); export it again"

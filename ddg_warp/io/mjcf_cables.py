@@ -21,6 +21,7 @@ from ddg_warp.io.paths import CurveError, shown
 PLUGIN = "mujoco.elasticity.cable"
 POSE = ("pos", "quat", "axisangle", "xyaxes", "zaxis", "euler")
 ROUND = ("capsule", "cylinder")
+MOST = 100_000  # points of a cable
 DENSITY = 1000.0  # of a geom without one, in MuJoCo [kg/m^3]
 VALUES = {"bend": "young", "twist": "shear"}  # of the plugin, in Pa
 UNREAD = (
@@ -131,9 +132,11 @@ def _points_of_composite(composite: Element, where: str) -> np.ndarray:
         if len(values) % 3:
             raise CurveError(f"{where}: vertex has {len(values)} numbers; give three for each point")
         return values.reshape(-1, 3)
-    count = int(_numbers(composite.get("count", "0"), f"{where}: count")[0])
+    count = _first(composite.get("count", "0"), f"{where}: count")
+    if not 2 <= count <= MOST:
+        raise CurveError(f"{where}: count = {count:g}; a cable has 2 to {MOST} points")
     size = np.pad(_numbers(composite.get("size", "1 0 0"), f"{where}: size"), (0, 3))
-    s = np.linspace(0.0, 1.0, max(count, 0))
+    s = np.linspace(0.0, 1.0, int(count))
     functions = {"s": size[0] * s, "0": 0.0 * s, "zero": 0.0 * s}
     functions |= {"cos(s)": size[1] * np.cos(np.pi * size[2] * s), "sin(s)": size[1] * np.sin(np.pi * size[2] * s)}
     kinds = composite.get("curve", "").split()
@@ -153,11 +156,20 @@ def _end_of(geom: Element | None, where: str) -> str:
     return " ".join(str(2.0 * value) for value in _numbers(geom.get("pos"), where))
 
 
-def _numbers(text: str, where: str) -> np.ndarray:
+def _numbers(text: str | None, where: str) -> np.ndarray:
+    words = (text or "").split()
     try:
-        return np.array([float(word) for word in text.split()])
+        return np.array([float(word) for word in words])
     except ValueError:
-        raise CurveError(f"{where} = {shown(text.split())!r} has no numbers; correct it") from None
+        raise CurveError(f"{where} = {shown(words)!r} has no numbers; correct it") from None
+
+
+def _first(text: str | None, where: str) -> float:
+    """Return the first number of a text."""
+    values = _numbers(text, where)
+    if not len(values):
+        raise CurveError(f"{where} is empty; give a number")
+    return float(values[0])
 
 
 def _located(copy: Element, path: Path) -> dict[str, np.ndarray]:
@@ -182,17 +194,17 @@ def _curves(cable: Cable, located: dict, instances: dict, unread: list[str], pat
     points = np.array([[located[name + suffix] for name in cable.sites] for suffix in suffixes])
     radius, attributes, unread = None, {"density": DENSITY}, list(unread)
     if (geom := cable.geom) is not None:
-        attributes["density"] = float(_numbers(geom.get("density", str(DENSITY)), f"{path}: density")[0])
+        attributes["density"] = _first(geom.get("density", str(DENSITY)), f"{path}: density")
         if geom.get("type", "capsule") not in ROUND:
             unread.append(f"section of geom type {geom.get('type')!r}, size {geom.get('size')}")
         elif geom.get("size"):
-            radius = float(_numbers(geom.get("size"), f"{path}: size")[0])
+            radius = _first(geom.get("size"), f"{path}: size")
     if (plugin := cable.plugin) is not None:
         source = instances.get(plugin.get("instance"), plugin)
         config = {each.get("key"): each.get("value") for each in source.findall("config")}
         for key, name in VALUES.items():
             if key in config:
-                attributes[name] = float(_numbers(config[key], f"{path}: {key}")[0])
+                attributes[name] = _first(config[key], f"{path}: {key}")
         unread += [f"{key} = {value} of the plugin" for key, value in config.items() if key not in VALUES]
     rods = len(suffixes)
     curves = checked_curves(

@@ -102,6 +102,9 @@ if find_spec("trimesh") and find_spec("meshio"):
     refuse("meshes read", {
         "an STL without triangles": (lambda: file("a.stl", "solid", read_mesh), "a.stl", "not a single face"),
         "a PLY of text": (lambda: file("a.ply", "solid", read_mesh), "a.ply", "no PLY file", "export it again"),
+        "a PLY cut short": (lambda: file("a.ply", "ply\n", read_mesh), "a.ply", "the header has no end"),
+        "a PLY that announces more": (lambda: file("a.ply", "ply\nelement vertex 99999\nend_header\n", read_mesh), "a.ply", "99999"),
+        "a VTK that announces more": (lambda: file("a.vtk", "# vtk\n\nASCII\nPOINTS 99999 double\n", read_mesh), "a.vtk", "99999"),
         "a GLB of text": (lambda: file("a.glb", "solid", read_mesh), "a.glb", "no GLB file", "export it again"),
         "an MSH cut short": (lambda: file("a.msh", "$MeshFormat\n4.1 0 8\n", read_mesh), "a.msh", "no MSH file"),
         "a VTU of text": (lambda: file("a.vtu", "solid", read_mesh), "a.vtu", "no VTU file"),
