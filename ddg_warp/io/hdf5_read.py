@@ -8,6 +8,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields as fields_of
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -27,6 +28,7 @@ from ddg_warp.typing import Array, Bools, FilePath, Floats, Integers
 
 CURVE_FIELDS = ("counts", "closed", "radius", "names", "batch")
 SURFACE_FIELDS = ("triangles", "first", "names", "thickness", "uv")
+PLAIN = ("points", "counts", "closed", "radius")  # datasets of a plain file
 COUNTS = "run"  # group of a checkpoint: counts of the run up to the frame
 FRAMES = ("points", "velocities", "directors", "obstacle_points", "body_poses")
 
@@ -483,28 +485,31 @@ def read_rods(path: FilePath, frame: int = -1, world: int = 0, *, outside: bool 
         worlds = len(points) if points.ndim == 3 else 1
         if not -worlds <= world < worlds:
             raise CurveError(f"{path}: there is no world {world}; it has {worlds}, counted from 0")
-        return _by_batch(reader.curves, points if points.ndim == 2 else points[world], path)
+        unread = [f"{len(reader) - 1} other frames"] * (len(reader) > 1) + [f"{worlds - 1} other worlds"] * (worlds > 1)
+        contents = {"surfaces": reader.surfaces, "obstacles": reader.obstacles, "rigid bodies": reader.rigid_bodies}
+        unread += [name for name, content in contents.items() if content is not None]
+        return _by_batch(reader.curves, points if points.ndim == 2 else points[world], path, tuple(unread))
 
 
 def _read_plain(file: h5py.File, path: Path) -> CurveSet:
-    points, *optional = (
-        _array(file[name]) if name in file else None for name in ("points", "counts", "closed", "radius")
-    )
+    points, *optional = (_array(file[name]) if name in file else None for name in PLAIN)
     counts, closed, radius = optional
     if counts is None and points.ndim != 3:
         raise CurveError(f"{path}: `points` has shape {points.shape} and there are no `counts`; add the points per rod")
     counts = np.full(points.shape[0], points.shape[1]) if counts is None else counts
-    return checked_curves(points, counts, False if closed is None else closed, radius, "points", str(path))
+    curves = checked_curves(points, counts, False if closed is None else closed, radius, "points", str(path))
+    return replace(curves, unread=tuple(name for name in file if name not in PLAIN))
 
 
-def _by_batch(curves: Curves, points: np.ndarray, path: Path) -> list[CurveSet]:
+def _by_batch(curves: Curves, points: np.ndarray, path: Path, unread: tuple[str, ...]) -> list[CurveSet]:
     sets = []
     for batch in np.unique(curves.batch):
         rods = curves.batch == batch
         mine = np.flatnonzero(np.repeat(rods, curves.counts))
         name = str(curves.names[rods][0])
         radius = curves.radius[mine]
-        sets.append(checked_curves(points[mine], curves.counts[rods], curves.closed[rods], radius, name, str(path)))
+        checked = checked_curves(points[mine], curves.counts[rods], curves.closed[rods], radius, name, str(path))
+        sets.append(replace(checked, unread=unread))
     return sets
 
 

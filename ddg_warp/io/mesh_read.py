@@ -78,7 +78,7 @@ def read_mesh(
     count, mesh = len(points), mesh.changed(points, mesh.triangles).used()
     if len(mesh.points) < count:
         warnings.warn(f"{path}: {mesh.unread[-1]}", SceneWarning, stacklevel=2)
-    return mesh if weld is None else mesh.welded(weld)
+    return mesh if weld is None else mesh.welded(weld).used()
 
 
 def _read(path: Path, prim: str | None, outside: bool) -> tuple[FileMesh, float | None, bool]:

@@ -324,8 +324,10 @@ def test_rods_are_read_from_files(tmp_path):
     with h5py.File(tmp_path / "grid.h5", "w") as file:
         file["points"] = np.arange(24.0).reshape(2, 4, 3)
         file["radius"] = 0.1
+        file["colors"] = np.zeros(3)
     (grid,) = read_rods(tmp_path / "grid.h5")
     assert list(grid.counts) == [4, 4] and grid.radius.shape == (8,)
+    assert (strands.unread, grid.unread) == (("4 other frames",), ("colors",))
 
 
 def test_bad_files_are_named(tmp_path):
