@@ -1,7 +1,8 @@
 """View of a trajectory for ParaView: the group /VTKHDF, transient PolyData (VTKHDF 2.1).
 
     elastic      polylines of rods and triangles of shells, with radius, velocity, director and recorded fields
-    obstacles    triangles of obstacles and of shapes of rigid bodies, with the index of the obstacle
+    obstacles    triangles of fixed obstacles, with the index of the obstacle
+    moving       likewise of moving obstacles and of shapes of rigid bodies, of the first worlds if there are many
     contacts     a vertex for each pair in contact, with force, friction and gap
 
 A run without obstacles and recorded contacts has the first block alone, as /VTKHDF itself. Others are a collection of blocks.
@@ -32,6 +33,7 @@ CELL_KINDS = ("Vertices", "Lines", "Polygons", "Strips")
 DATA = {"PointData": "at_points", "CellData": "at_cells"}
 STEP_CHUNK = 64
 ROW_CHUNK = 1024
+MOST_POINTS = 20_000  # of moving obstacles in a frame; the first world is always complete
 STATIC_OFFSETS = {"CellOffsets": (len(CELL_KINDS),), "ConnectivityIdOffsets": (len(CELL_KINDS),)}
 SHOWN = ("force", "friction", "gap")  # of pairs in contact
 
@@ -48,11 +50,15 @@ def write_view(
         bodies: Rigid bodies, whose shapes are the last obstacles, or None.
     """
     trajectory = file["trajectory"]
-    names = ["elastic"] + ["obstacles"] * (obstacles is not None) + ["contacts"] * ("contacts" in trajectory)
+    moved = np.zeros(0, bool) if obstacles is None else obstacles.moved
+    names = ["elastic", *["obstacles"] * bool((~moved).any()), *["moving"] * bool(moved.any())]
+    names += ["contacts"] * ("contacts" in trajectory)
     blocks = _blocks(file, names)
     _write_elastic(blocks["elastic"], trajectory, shapes)
-    if obstacles is not None:
-        _write_obstacles(blocks["obstacles"], trajectory, obstacles, bodies, shapes.worlds)
+    if "obstacles" in blocks:
+        _write_fixed(blocks["obstacles"], trajectory, obstacles)
+    if "moving" in blocks:
+        _write_moving(blocks["moving"], trajectory, obstacles, bodies, shapes.worlds)
     if "contacts" in trajectory:
         _write_contacts(blocks["contacts"], trajectory)
 
@@ -123,33 +129,43 @@ def _write_elastic(view: h5py.Group, trajectory: h5py.Group, shapes: Shapes) -> 
     _write_steps(view, offsets)
 
 
-def _write_obstacles(
+def _write_fixed(view: h5py.Group, trajectory: h5py.Group, obstacles: Obstacles) -> None:
+    """Write surfaces of fixed obstacles, once."""
+    chosen = np.flatnonzero(~obstacles.moved)
+    if not len(view):
+        view["Points"] = np.concatenate([obstacles.points(k) for k in chosen])
+        _describe_obstacles(view, trajectory, obstacles, chosen)
+    none = np.zeros(len(trajectory["time"]), int)
+    _write_steps(view, {"PointOffsets": none, "CellDataOffsets/obstacle": none})
+
+
+def _write_moving(
     view: h5py.Group, trajectory: h5py.Group, obstacles: Obstacles, bodies: Bodies | None, worlds: int
 ) -> None:
-    """Write surfaces of obstacles, once without motion, and for every frame in every world if one moves."""
-    shown = [(k, world) for k in range(len(obstacles)) for world in range(worlds if obstacles.moved[k] else 1)]
-    moving = bool(obstacles.moved.any())
-    sizes = np.array([len(obstacles.points(k)) for k, _ in shown])
-    frames = np.arange(len(trajectory["time"]))
+    """Write surfaces of moving obstacles for every frame, of the first worlds if there are many."""
+    moving = np.flatnonzero(obstacles.moved)
+    of_a_world = sum(len(obstacles.points(k)) for k in moving)
+    shown = max(1, min(worlds, MOST_POINTS // of_a_world))
     if not len(view):
-        cells = [obstacles.cells(k) + first for (k, _), first in zip(shown, np.cumsum(sizes) - sizes, strict=True)]
-        triangles = np.concatenate(cells)
-        _write_topology(
-            view, trajectory, [sizes.sum()], {"Polygons": (triangles.ravel(), 3 * np.arange(len(triangles) + 1))}
-        )
-        numbers = np.repeat([k for k, _ in shown], [len(each) for each in cells])
-        view.create_group("CellData")["obstacle"] = numbers
-        if not moving:
-            view["Points"] = np.concatenate([obstacles.points(k) for k, _ in shown])
+        _describe_obstacles(view, trajectory, obstacles, np.tile(moving, shown))
 
     def points(frame: int) -> np.ndarray:
-        nodes = _moved_nodes(trajectory, frame, obstacles, bodies).reshape(worlds, -1, 3)
-        rows = [nodes[world, obstacles.rows(k)] if obstacles.moved[k] else None for k, world in shown]
-        return np.concatenate([obstacles.points(k, each) for (k, _), each in zip(shown, rows, strict=True)])
+        nodes = _moved_nodes(trajectory, frame, obstacles, bodies).reshape(worlds, -1, 3)[:shown]
+        return np.concatenate([obstacles.points(k, each[obstacles.rows(k)]) for each in nodes for k in moving])
 
-    if moving:
-        _append(view, "Points", int(sizes.sum()), len(frames), points)
-    _write_steps(view, {"PointOffsets": moving * sizes.sum() * frames, "CellDataOffsets/obstacle": 0 * frames})
+    frames = np.arange(len(trajectory["time"]))
+    _append(view, "Points", shown * of_a_world, len(frames), points)
+    _write_steps(view, {"PointOffsets": shown * of_a_world * frames, "CellDataOffsets/obstacle": 0 * frames})
+
+
+def _describe_obstacles(view: h5py.Group, trajectory: h5py.Group, obstacles: Obstacles, shown: np.ndarray) -> None:
+    """Write triangles of obstacles in the order shown, with the index of the obstacle."""
+    sizes = np.array([len(obstacles.points(k)) for k in shown])
+    cells = [obstacles.cells(k) + first for k, first in zip(shown, np.cumsum(sizes) - sizes, strict=True)]
+    triangles = np.concatenate(cells)
+    polygons = (triangles.ravel(), 3 * np.arange(len(triangles) + 1))
+    _write_topology(view, trajectory, [sizes.sum()], {"Polygons": polygons})
+    view.create_group("CellData")["obstacle"] = np.repeat(shown, [len(each) for each in cells])
 
 
 def _moved_nodes(trajectory: h5py.Group, frame: int, obstacles: Obstacles, bodies: Bodies | None) -> np.ndarray:

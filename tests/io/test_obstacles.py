@@ -214,7 +214,7 @@ def test_vtk_reads_obstacles_contacts_and_directors_while_they_are_written(devic
     path = tmp_path / "trajectory.vtkhdf"
     model = scene().build(device=device, worlds=worlds)
     states = record(model, tmp_path, 3, DT, contacts=True, directors=True)
-    assert set(vtk_blocks(path, 3)) == {"elastic", "obstacles", "contacts"}
+    assert set(vtk_blocks(path, 3)) == {"elastic", "obstacles", "moving", "contacts"}
     integrator, state = ddg.Integrator(model), states[-1]
     with ddg.Recorder(model, tmp_path, block=1, resume=True, usd=False) as recorder:
         for _ in range(3):
@@ -225,12 +225,10 @@ def test_vtk_reads_obstacles_contacts_and_directors_while_they_are_written(devic
             np.testing.assert_allclose(vtk_points(shown["elastic"]), state.points().reshape(-1, 3), rtol=1e-15)
     for frame, state in enumerate(states):
         shown, nodes = vtk_blocks(path, frame), state.obstacle_points().reshape(worlds, -1, 3)
-        expected = [
-            model.obstacles.points(k, nodes[world, model.obstacles.rows(k)] if moved else None)
-            for k, moved in enumerate(model.obstacles.moved)
-            for world in range(worlds if moved else 1)
-        ]
-        np.testing.assert_allclose(vtk_points(shown["obstacles"]), np.concatenate(expected), atol=1e-6)
+        fixed = [model.obstacles.points(k) for k in (0, 4)]
+        moving = [model.obstacles.points(k, each[model.obstacles.rows(k)]) for each in nodes for k in (1, 2, 3)]
+        np.testing.assert_allclose(vtk_points(shown["obstacles"]), np.concatenate(fixed), atol=1e-6)
+        np.testing.assert_allclose(vtk_points(shown["moving"]), np.concatenate(moving), atol=1e-6)
         pairs = model.contacts(state)
         assert shown["contacts"].GetNumberOfVerts() == len(pairs)
         np.testing.assert_allclose(vtk_points(shown["contacts"]), pairs.point, rtol=1e-15)
@@ -239,5 +237,5 @@ def test_vtk_reads_obstacles_contacts_and_directors_while_they_are_written(devic
         director = vtk_values(shown["elastic"].GetPointData(), "director").reshape(worlds, -1, 3)
         np.testing.assert_allclose(director[:, :-1], state.directors().reshape(worlds, -1, 3), atol=1e-6)
     assert {len(model.contacts(state)) > 0 for state in states} == {True, False}
-    numbers = vtk_values(shown["obstacles"].GetCellData(), "obstacle")
-    assert np.count_nonzero(numbers == 4) == len(HEAD[1]) and np.count_nonzero(numbers == 3) == 12 * worlds
+    numbers = [vtk_values(shown[name].GetCellData(), "obstacle") for name in ("obstacles", "moving")]
+    assert np.count_nonzero(numbers[0] == 4) == len(HEAD[1]) and np.count_nonzero(numbers[1] == 3) == 12 * worlds

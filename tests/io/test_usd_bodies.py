@@ -301,5 +301,5 @@ def test_vtk_shows_shapes_of_bodies(device, tmp_path):
     model, states = run(device, tmp_path, 3)
     last = len(model.obstacles) - 1
     shapes = model.obstacles.points(last, states[-1].obstacle_points()[model.obstacles.rows(last)])
-    shown = vtk_points(vtk_blocks(tmp_path / "trajectory.vtkhdf", 3)["obstacles"])
+    shown = vtk_points(vtk_blocks(tmp_path / "trajectory.vtkhdf", 3)["moving"])
     np.testing.assert_allclose(shown[-len(shapes) :], shapes, atol=1e-6)
