@@ -111,6 +111,8 @@ def write(path: FilePath, count: int = 400, frames: int = 49, subdivisions: int 
     mesh.CreateFaceVertexCountsAttr([3] * len(triangles))
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(triangles.astype(np.int32).ravel()))
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    mesh.GetPointsAttr().Set(vectors(sphere))  # some readers refuse a mesh without default values
+    mesh.GetExtentAttr().Set(UsdGeom.PointBased.ComputeExtent(vectors(sphere)))
     for frame in range(frames):
         moved = vectors(head(frame, sphere))
         mesh.GetPointsAttr().Set(moved, FIRST + frame)

@@ -125,6 +125,15 @@ def test_blender_plays_the_layer(run):
     np.testing.assert_allclose(points, again.points, atol=1e-6)
 
 
+@pytest.mark.filterwarnings("ignore")  # of centimetres
+def test_newton_opens_the_layer(run):
+    newton = pytest.importorskip("newton")
+    pytest.importorskip("newton_usd_schemas")
+    builder = newton.ModelBuilder()
+    builder.add_usd(str(run[1].path))
+    assert builder.shape_count == 1  # the head
+
+
 def test_one_command_does_all(tmp_path, capsys):
     path, layer = tmp_path / "shot.usda", tmp_path / "hair.usda"
     shot.write(path, 6, 3, 1)
