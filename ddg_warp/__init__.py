@@ -6,7 +6,8 @@
 
 Describe a scene: `Scene`, `Circle`, `Ellipse`, `Rectangle`, `Ribbon`, `Stiffness`, `Material`, `Law`.
 Supports, motions, controls: `Motion`, `FrameMotion`, `Grip`, `Controls`, `Samples`.
-Obstacles, fluid: `Plane`, `Sphere`, `Capsule`, `Box`, `Mesh`, `AnimatedMesh`, `Viscous`, `Granular`.
+Obstacles: `Plane`, `Sphere`, `Capsule`, `Box`, `Mesh`, `AnimatedMesh`.
+Drag, flows: `Viscous`, `Granular`, `QuadraticDrag`, `FlowGrid`, `Turbulence`, `Gust`.
 Run it: `simulate`, `Dynamics`, `Statics`, `PathAnalysis`, `StopCriterion`, `Displacement`, `Check`, `Recorder`, `bench`.
 See it: `Viewer`, `movie`.
 Loops: `Integrator`, `AdaptiveStepper`, `statics`, `continuation`, `stability`.

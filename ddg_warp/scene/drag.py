@@ -362,7 +362,11 @@ class Laws:
         """Refuse an invalid flow at t = 0, a flow without objects with drag, or laws of two kinds."""
         if not scene.drags and not scene.shell_drags and (callable(scene.flow) or np.any(scene.flow)):
             raise SceneError("flow is given, and nothing feels it; call drag(...), or leave flow out")
-        points = [np.zeros((0, 3)), *(batch.points[0] for batch in scene.batches), *(s.points for s in scene.shells)]
+        points = [
+            np.zeros((0, 3)),
+            *(p for batch in scene.batches for p in batch.points[:1]),
+            *(s.points for s in scene.shells),
+        ]
         flow_at(scene.flow, 0.0, scene.dimension, np.concatenate(points), SceneError)
         shells = [drag.shell for drag in scene.shell_drags]
         for shell in shells:

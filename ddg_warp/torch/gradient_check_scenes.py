@@ -174,7 +174,7 @@ def _on_box(scene: Scene, material: Material) -> None:
         Box((0.18, 0.05, -0.085), (0.05, 0.04, 0.03), radius=0.004), density=300.0, angular_velocity=(1.0, 2.0, 3.0)
     )
     scene.add_obstacle(Plane((0.0, 0.0, -0.135), (-0.03, 0.0, 1.0)))
-    scene.contact(law="barrier", range=0.02, stiffness=5.0, friction=0.3, velocity=0.5)
+    scene.contact(law="barrier", range=0.02, stiffness=5.0, friction=0.3, velocity=0.5, friction_iterations=1)
 
 
 def _over_plane(scene: Scene, shell: int) -> None:

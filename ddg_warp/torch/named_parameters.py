@@ -292,6 +292,11 @@ def _shell_coefficients(model, name: str) -> Iterator[_Part]:
     counts = [len(shell.triangles) for shell in model.scene.shells]
     rows = np.concatenate([sum(counts[: drag.shell]) + np.arange(counts[drag.shell]) for drag in drags])
     usual, shape = coupled.host.shell_coefficients[row], (coupled.worlds, len(rows), 1)
+
+    def found(inputs):
+        values = inputs.coefficients.get("shell_drag")
+        return None if values is None else view(values)[row].view(shape[:2])
+
     yield _Part(
         -1,
         False,
@@ -301,5 +306,5 @@ def _shell_coefficients(model, name: str) -> Iterator[_Part]:
         rows,
         usual,
         lambda: view(coupled.shell_coefficients)[row].view(shape),
-        lambda inputs: view(inputs.coefficients["shell_drag"])[row].view(shape[:2]),
+        found,
     )

@@ -577,7 +577,8 @@ CALLS["contact of a coil"] = Call(ddg.Scene.contact, observe_coil, {}, {"exclusi
 
 scene_call("contact_between", {"one": "low", "other": "high", "friction": 0.3}, {
     "one": "high", "other": "low", "ignore": Change(True, {"friction": NOTHING, "stiffness": 10.0}, False, refused=True),
-    "friction": 0.1, "stiffness": 10.0, "range": 6e-3}, crossed_rods_in_contact, add_lateral_forces, steps=2)  # fmt: skip
+    "friction": 0.1, "stiffness": 10.0, "range": 6e-3, "root_length": 0.4},
+    crossed_rods_in_contact, add_lateral_forces, steps=2)  # fmt: skip
 CALLS["contact_between"].rows["ignore"] = Change(True, {"friction": NOTHING}, refused=False)
 FLOOR = ddg.Plane((0.0, 0.0, -0.0105))
 

@@ -189,7 +189,8 @@ class ExactSystem:
         if self.contact:
             self.contact.hessian.assemble()
             if self.rigid_bodies:
-                self.rigid_bodies.condense_contact(self.contact.hessian.diagonal)
+                hessian = self.contact.hessian
+                self.rigid_bodies.condense_contact(hessian.products.sets, hessian.diagonal)
             self.contact.hessian.add_to_bands(self.islands.arrays[0])
 
     def check(self) -> None:
