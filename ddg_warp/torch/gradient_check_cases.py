@@ -300,7 +300,7 @@ class Case:
         moved = [motion for motion in self.model.motions if not isinstance(motion, Grip)]
         parts = [*self.model.groups, *([self.model.coupled] if self.model.coupled is not None else [])]
         loads = any(part.host.timed for part in parts)
-        timed = field is not None and (callable(field.value) or callable(field.gradient))
+        timed = field is not None and not (field.value.constant and field.gradient.constant)
         if moved or loads or timed or callable(self.model.scene.flow):
             return "the reverse does not differentiate motions, loads, flows and fields that are functions of time"
         return ""
