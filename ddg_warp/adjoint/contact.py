@@ -57,7 +57,7 @@ class ContactAdjoint:
         kinds = [pairs.kind for pairs in search.lists]
         self._vjp = [pull_kernel(kind, contact.density, real) for kind in kinds]
         leads = [friction.directions[0] is not None for friction in terms.frictions]
-        self._rolls = [friction.rolls for friction in terms.frictions] or [False] * len(kinds)
+        turning = [(friction.rolls, friction.rotates) for friction in terms.frictions] or [(False, False)] * len(kinds)
         self._spins = terms.spins if terms.frictions and terms.spins.any else None
         self.friction_jacobian, spins = FrictionJacobian(coupled, self.system), bool(self._spins)
         self._direct = contact_parameters.direction_kernels(real) if any(leads) else ()
@@ -69,9 +69,9 @@ class ContactAdjoint:
         self._sides = [contact_parameters.side_kernels(kind, real) for kind in kinds]
         self._group, self._bodies = contact_parameters.group_kernels(real), contact_parameters.body_kernel(real)
         self._items, self._add = [Incidence(kind, nodes, every) for kind in kinds], sum_kernel(real, serial)
-        rolling = zip(kinds, self._items, self._rolls, strict=True)
         self._friction_items = [
-            Incidence(kind, nodes, every, True) if rolls else items for kind, items, rolls in rolling
+            Incidence(kind, nodes, every, *turns) if any(turns) else items
+            for kind, items, turns in zip(kinds, self._items, turning, strict=True)
         ]
         self.by_groups = self._zeros(NUMBERS, *terms.law.stiffness.shape)
         self.by_radius = self._zeros(*coupled.contact_parameters["radius"].shape)
@@ -139,14 +139,14 @@ class ContactAdjoint:
             if friction_set:
                 items = self._friction_items[i]
                 items.list(friction_set.count, friction_set.factor)
-                written = self.friction_jacobian.vjp(
-                    i, (friction_set.factor.nodes, friction_set.factor.angles), positions, w, rate, self._numbers
-                )
+                factor = friction_set.factor
+                ends = factor.nodes, factor.angles, factor.rotations
+                written = self.friction_jacobian.vjp(i, ends, positions, w, rate, self._numbers)
                 for values, gradient in zip(written, (grad_q, by_before, by_lagged), strict=True):
                     self._add_up(items, friction_set, values, gradient)
                 self._sum(i, items, friction_set)
                 self._lead(i, friction_set, by_lagged)
-                if friction_set.rolls:
+                if friction_set.rolls or friction_set.rotates:
                     self._to_primitives(
                         i,
                         items,

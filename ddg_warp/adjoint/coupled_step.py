@@ -323,6 +323,7 @@ class CoupledStepAdjoint:
         read = [end, more, *masses, self._resisted, coupled.count, last, self._rates]
         self._launch(self._solution, grid, read, [components(grad_q)])
         self._friction_rate.fill_(kept.friction_rate or rate)
+        slips = self.bodies.begin_slip(before) if self.bodies and self.contact else before.q
         rough, lag_pairs = None, reversed(list(pairwise([before.q, *kept.lagged, solved.q])))
         if kept.friction_rate:  # normal forces of the equilibrium
             rough, lag_pairs = self.contact.matrix(solved.q, before.q, self._friction_rate), [(solved.q, solved.q)]
@@ -330,7 +331,7 @@ class CoupledStepAdjoint:
             damped = replace(solved, q=q, last=before.last)
             if self.contact:
                 rates = after.rate, before.rate if lag_q is before.q else None
-                self.contact.system.find(lag_q, before.q, q, self._friction_rate, rates)
+                self.contact.system.find(lag_q, slips, q, self._friction_rate, rates)
             if self.bodies:
                 self._solve_bodies(damped, rate, kept, grad_q, w, factors)
             else:
@@ -357,7 +358,7 @@ class CoupledStepAdjoint:
                     for source, gradient in ((before.q, start.q), (q, grad_q), (lag_q, cotangents.lagged))
                     if source is lag_q
                 )
-                self.contact.vjp((lag_q, before.q, q), w, self._friction_rate, (by_lagged, start.q, grad_q))
+                self.contact.vjp((lag_q, slips, q), w, self._friction_rate, (by_lagged, start.q, grad_q))
                 if kept.friction_rate:
                     self.contact.roll(q, before.q, start.q, grad_q)
             if lag_q is not before.q and lag_q is not q:

@@ -42,7 +42,9 @@ class RigidBodyAdjoint:
             return wp.zeros(size, dtype=dtype, device=coupled.device)
 
         self._islands = Islands(coupled.worlds, real, coupled.device)
-        self._turned, self._by_turn, self._rhs, self._last, self._q, self._v = (make(blocks) for _ in range(6))
+        self._turned, self._by_turn, self._rhs, self._last, self._q, self._v, self._slip = (
+            make(blocks) for _ in range(7)
+        )
         self._worlds, self._more = [make(coupled.worlds, int) for _ in range(2)], make(1, int)
         self._lag = coupled.lagged()[1]
         self.gradients = gradients = kernels.gradients_type(real)()
@@ -102,6 +104,12 @@ class RigidBodyAdjoint:
         wp.copy(self._turned, before.q)
         inputs = [before.rotation, self.bodies.predicted, self.tables.spins, self.coupled.blocks]
         self._launch(self._turn, inputs, [self._turned])
+
+    def begin_slip(self, before: CoupledState) -> wp.array:
+        """Return the start of slip (W N,). Its blocks of rotations have the rotation vectors from P to R_n."""
+        wp.copy(self._slip, before.q)
+        self.bodies.begin_slip(before.rotation, self._slip)
+        return self._slip
 
     def end(
         self,
@@ -189,12 +197,13 @@ class RigidBodyAdjoint:
         Args:
             by_frame, own_rows: gradients by frames, added to, and by own lagged rows, overwritten.
             by_data: gradients by constant data, added to.
+            start: gradients by the start. Its dof blocks have the gradients by rotation vectors from P to R_n, which are zeroed.
         """
         tables = self.tables
         self._by_turn.zero_()
         self._assembly.unturn(solved, before, self._turned, own_rows, self._by_turn, by_frame, by_data)
         inputs = [before.rotation, before.momentum, tables.moments, self.bodies.predicted, self._by_turn]
-        inputs += [tables.spins, self.coupled.blocks, *step, self.gradients]
+        inputs += [start.q, tables.spins, self.coupled.blocks, *step, self.gradients]
         self._launch(self._flight, inputs, [start.rotation, start.momentum])
 
     def _launch(self, kernel, inputs: list, outputs: list) -> None:

@@ -9,8 +9,8 @@ force along w is
     u = (t1, t2) . sum_i weight_i (x_i - x_i^n) .
 
 Its reverse yields derivatives by normal force, normal and weights at y, by the slip from the start x^n to x, and by coefficient and
-rate. Directed or rolling friction adds the directions of rods at y. Spinning obstacles and rolling rods add their rotations. The matrix
-by x is symmetric, since lagged data do not depend on x.
+rate. Directed or rolling friction adds the directions of rods at y. Spinning obstacles, rolling rods and surfaces of rigid bodies add
+their rotations. The matrix by x is symmetric, since lagged data do not depend on x.
 
 Initially y is x^n. With `friction_iterations` > 1, y is the previous solution, so that a step is a sequence of solves. The
 derivative by y of one solve is the g of the solve before, each with its own matrix.
@@ -20,7 +20,7 @@ from functools import cache
 
 import warp as wp
 
-from ddg_warp.kernels.collision.contact.assembly import ANGLES, PAIR_NODES
+from ddg_warp.kernels.collision.contact.assembly import ANGLES, BODIES, FIRST_BODY, PAIR_NODES
 from ddg_warp.kernels.collision.contact.closest_points import node_types, tangents_function
 from ddg_warp.kernels.collision.contact.pair_evaluation import (
     by_rate_function,
@@ -38,7 +38,7 @@ STIFFNESS, RANGE, THICKNESS, FRICTION, RATE = range(5)
 NUMBERS = 5  # parameters of a pair
 TURN, ARM = 0, 3  # rows of a spinning object: rotation (3), radius
 SPUN = 4
-ROLLED = 2  # rows of a rolling pair: radii of both primitives
+ROLLED = 2  # rows of a rolling or rotating pair: radii of both primitives
 
 
 @cache
@@ -83,13 +83,14 @@ def pull_kernel(kind: Kind, density: Density, real):
 
 @cache
 def friction_jacobian_kernel(
-    kind: Kind, density: Density, friction: Density, real, directed: bool, spins: bool, rolls: bool
+    kind: Kind, density: Density, friction: Density, real, directed: bool, spins: bool, rolls: bool, rotates: bool
 ):
     """Build the kernel of derivatives of friction by local node index of the solution, the start and the lagged positions.
 
     Derivatives by parameters of pairs are as in `pull_kernel`. `directed` or `rolls`: also by the directions of rods (capacity,);
     `rod_nodes` and `multipliers` are as in `collision.friction.potential.lag_kernel`. `spins`: also by `STRAIGHT_ROTATION_LIMIT`
         and `ARM` of the object (SPUN, capacity). `rolls`: also by twist angles, and by radii of both primitives (ROLLED, capacity).
+        `rotates`: also by rotations of rigid bodies, and by these radii.
     """
     Law, Sides = law_struct(real), sides_struct(real)
     X, W, P = node_types(real)
@@ -99,6 +100,7 @@ def friction_jacobian_kernel(
     parameters_of, corners = read_functions(kind, real)
     tangents, groups, along_rod = tangents_function(real), groups_function(real), directed_basis(real)
     spun, A = spun_function(real), wp.types.vector(ANGLES, real)
+    B, R = wp.types.vector(BODIES, real), wp.types.matrix((BODIES, 3), real)
     _, radii, levers = rolling_functions(kind, real)
     leads = directed or rolls
     slope_of = friction.laws(real, 2)[1]
@@ -122,6 +124,9 @@ def friction_jacobian_kernel(
         r: A,
         rolled: A,
         v_rolled: A,
+        surfaces: B,
+        rotated: R,
+        v_rotated: R,
     ):
         """Return the derivative along v of the friction potential lagged at y, for displacements `moved` since the start."""
         _e, g = evaluate(y, p, threshold, inner)
@@ -139,6 +144,9 @@ def friction_jacobian_kernel(
             lever = levers(d, y[3] - y[2], n, r, angles)
             move += lever[0] * rolled[0] + lever[1] * rolled[1]
             along += lever[0] * v_rolled[0] + lever[1] * v_rolled[1]
+        if wp.static(rotates):
+            move += wp.cross(rotated[0] * surfaces[0] + rotated[1] * surfaces[1], n)
+            along += wp.cross(v_rotated[0] * surfaces[0] + v_rotated[1] * surfaces[1], n)
         if wp.static(directed):
             forwards, t2, back = along_rod(n, d, multiplier)
             t1 = wp.where(wp.dot(forwards + back, move) < real(0.0), back, forwards)
@@ -157,6 +165,8 @@ def friction_jacobian_kernel(
         law: Law,
         nodes: wp.array(dtype=wp.vec4i),
         angles: wp.array(dtype=wp.vec2i),
+        rotations: wp.array(dtype=wp.vec2i),
+        radii_of_bodies: wp.array(dtype=B),
         used: wp.array(dtype=int),
         lagged: wp.array(dtype=V),
         start: wp.array(dtype=V),
@@ -181,7 +191,7 @@ def friction_jacobian_kernel(
                 numbers[i, pair] = real(0.0)
             if wp.static(leads):
                 directions[pair] = V()
-            if wp.static(rolls):
+            if wp.static(rolls or rotates):
                 for side in range(wp.static(ROLLED)):
                     radii_out[side, pair] = real(0.0)
             if wp.static(spins):
@@ -203,6 +213,14 @@ def friction_jacobian_kernel(
                         if turned[side] >= 0:
                             rolled[side] = x[turned[side]][0] - start[turned[side]][0]
                             v_rolled[side] = -w[turned[side]][0]
+                surfaces, rotated, v_rotated = B(), R(), R()
+                if wp.static(rotates):
+                    surfaces = radii_of_bodies[pair]
+                    for side in range(wp.static(BODIES)):
+                        body = rotations[pair][side]
+                        if body >= 0:
+                            rotated[side] = x[body] - start[body]
+                            v_rotated[side] = -w[body]
                 spinning_object, turn, arm = int(-1), V(), real(0.0)
                 if wp.static(spins):
                     spinning_object, arm = spun(sides, spinning, world, i, j)
@@ -210,9 +228,28 @@ def friction_jacobian_kernel(
                         turn = turns[spinning_object]
                 p, threshold, inner = parameters_of(law, sides, pairs[pair])
                 n = nodes[pair]
-                dy, dx, _dv, dd, _dw, dp, _dt, _di, dmu, _dn, dr, dturn, darm, _da, dradii, drolled, _dw2 = wp.grad(
-                    force
-                )(
+                (
+                    dy,
+                    dx,
+                    _dv,
+                    dd,
+                    _dw,
+                    dp,
+                    _dt,
+                    _di,
+                    dmu,
+                    _dn,
+                    dr,
+                    dturn,
+                    darm,
+                    _da,
+                    dradii,
+                    drolled,
+                    _dr,
+                    dsurfaces,
+                    drotated,
+                    _db,
+                ) = wp.grad(force)(
                     corners(lagged, n),
                     corners(x, n) - corners(start, n),
                     -corners(w, n),
@@ -230,6 +267,9 @@ def friction_jacobian_kernel(
                     r,
                     rolled,
                     v_rolled,
+                    surfaces,
+                    rotated,
+                    v_rotated,
                 )
                 for slot in range(wp.static(PAIR_NODES)):
                     parts[slot, pair] = V(dx[slot, 0], dx[slot, 1], dx[slot, 2])
@@ -246,6 +286,13 @@ def friction_jacobian_kernel(
                         radii_out[side, pair] = dradii[side]
                         parts[wp.static(PAIR_NODES) + side, pair] = V(drolled[side], real(0.0), real(0.0))
                         start_parts[wp.static(PAIR_NODES) + side, pair] = V(-drolled[side], real(0.0), real(0.0))
+                if wp.static(rotates):
+                    for side in range(wp.static(BODIES)):
+                        radii_out[side, pair] = radii_out[side, pair] + dsurfaces[side]
+                        parts[wp.static(FIRST_BODY) + side, pair] = V(
+                            drotated[side, 0], drotated[side, 1], drotated[side, 2]
+                        )
+                        start_parts[wp.static(FIRST_BODY) + side, pair] = -parts[wp.static(FIRST_BODY) + side, pair]
                 if wp.static(spins):
                     if spinning_object >= 0:
                         for i in range(3):

@@ -297,6 +297,7 @@ def flight_kernel(real):
         moments: wp.array(dtype=V),
         predicted: wp.array(dtype=M),
         by_turn: wp.array(dtype=V),
+        by_start: wp.array(dtype=V),
         spins: wp.array(dtype=int),
         blocks: int,
         rates: wp.array(dtype=real),
@@ -305,13 +306,18 @@ def flight_kernel(real):
         rotation_out: wp.array(dtype=M),
         momentum_out: wp.array(dtype=V),
     ):
-        """`by_turn`: gradient by the rotation vectors from R_n to P, at the blocks of rotations."""
+        """Reverse flights.
+
+        `by_turn`, `by_start`: gradients by the rotation vectors from R_n to P and back, at the blocks of rotations. The latter are
+            zeroed.
+        """
         w, b = wp.tid()
         i, k = w * spins.shape[0] + b, spins[b] + w * blocks
         begin, inertia, rate, kept = rotation[i], moments[i], rates[w], rates[w] + dampings[0]
         angular = momentum[i] * (rate / kept)
         between = predicted[i] * wp.transpose(begin)
-        turn = wp.inverse(wp.transpose(tangent(vector(between)))) * by_turn[k]
+        turn = wp.inverse(wp.transpose(tangent(vector(between)))) * (by_turn[k] - by_start[k])
+        by_start[k] = V()
         by_begin = -(wp.transpose(between) * turn)
         turn += gradients.predicted[i]
         parts = parts_of(begin, angular, inertia, real(1.0) / rate)

@@ -1,8 +1,9 @@
-"""Gradients through rigid bodies: conservation, large rotations within a step, and refusals.
+"""Gradients through rigid bodies: conservation, large rotations within a step, rolling, and failures.
 
 `test_gradients_table.py` compares every input of rods with bodies with differences.
 """
 
+import numpy as np
 import pytest
 
 import ddg_warp as ddg
@@ -82,6 +83,53 @@ def test_a_pushed_top_turns_far(device):
         gradient,
         expected,
     )
+
+
+@pytest.mark.parametrize("mu", [0.1, 0.5], ids=["slides", "rolls"])
+def test_a_ball_slides_or_rolls_down_an_incline(device, mu):
+    """Rates, mass, inertia, friction and radius against differences; sliding balls have d omega / d mu = g cos(slope) t / (k R)."""
+    slope, radius, steps, dt = 0.5, 0.02, 10, 1e-3
+    normal, down = np.array([np.sin(slope), 0.0, np.cos(slope)]), np.array([np.cos(slope), 0.0, -np.sin(slope)])
+    scene = ddg.Scene()
+    scene.add_body(ddg.Sphere(tuple((radius + 1.86e-4) * normal), radius), density=1000.0, velocity=tuple(0.3 * down))
+    scene.add_obstacle(ddg.Plane(normal=tuple(normal)))
+    scene.contact(range=2e-4, stiffness=1e5, friction=mu, friction_iterations=1)
+    simulator = Simulator(scene.build(device=device, precision="float64"), dt, rtol=1e-13)
+    usual = {
+        name: simulator.parameter(name) for name in ("body.mass", "body.inertia", "contact.friction", "contact.radius")
+    }
+    start = simulator.initial_state()
+    spinning = 0.0 if mu < 0.2 else 0.3 / radius  # [rad/s]
+    rates = start.body_rates + torch.tensor(
+        [[[0.0, 0.0, 0.0, 0.0, spinning, 0.0]]], dtype=REAL, device=simulator.device
+    )
+    weights = torch.linspace(0.5, 1.5, 12, dtype=REAL, device=simulator.device).view(3, 4)
+
+    def end(x):
+        velocity, spin, (mass, inertia, friction, size) = x.split([3, 3, 4])
+        changed = {
+            "body.mass": usual["body.mass"] * mass.exp(),
+            "body.inertia": usual["body.inertia"] * inertia.exp(),
+            "contact.friction": usual["contact.friction"] + friction,
+            "contact.radius": usual["contact.radius"] + 1e-6 * size,
+        }
+        state = simulator.initial_state(body_rates=rates + torch.cat([0.1 * velocity, spin]))
+        for _ in range(steps):
+            state = simulator.step(state, changed)
+        return state
+
+    def loss(x):
+        state = end(x)
+        return (state.body_poses * weights).sum() + (state.body_rates * weights.view(2, 6)[0]).sum()
+
+    zero = torch.zeros(10, dtype=REAL, device=simulator.device)
+    x = zero.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(x), x)
+    expected = differences(lambda y: loss(y).detach(), zero)
+    torch.testing.assert_close(gradient, expected, rtol=2e-7, atol=0.0)
+    if mu < 0.2:
+        (gradient,) = torch.autograd.grad(end(x).body_rates[0, 0, 4], x)
+        assert gradient[8].item() == pytest.approx(9.81 * np.cos(slope) * steps * dt / (0.4 * radius), rel=1e-2)
 
 
 def test_a_world_without_a_finite_wrench_fails_alone(device):

@@ -6,7 +6,7 @@ from scipy import sparse
 
 from ddg_warp import device_arrays
 from ddg_warp.kernels.adjoint.contact import NUMBERS, ROLLED, SPUN, friction_jacobian_kernel
-from ddg_warp.kernels.collision.contact.assembly import ITEMS, PAIR_NODES
+from ddg_warp.kernels.collision.contact.assembly import FIRST_BODY, ITEMS, PAIR_NODES
 from ddg_warp.kernels.terms import FRICTION_LAWS
 from ddg_warp.solve.collision.rolling_rotation import rotated_by
 
@@ -29,6 +29,7 @@ class FrictionJacobian:
         law, friction = contact_parameters.density, FRICTION_LAWS[contact_parameters.law.friction_law]
         self._spins = bool(terms.frictions) and terms.spins.any
         self._rolls = any(friction_terms.rolls for friction_terms in terms.frictions)
+        self._rotates = any(friction_terms.rotates for friction_terms in terms.frictions)
         self._leads = any(friction_terms.directions[0] is not None for friction_terms in terms.frictions)
         self.kernels = [
             friction_jacobian_kernel(
@@ -39,6 +40,7 @@ class FrictionJacobian:
                 friction_terms.directions[1] is not None,
                 self._spins,
                 friction_terms.rolls,
+                friction_terms.rotates,
             )
             for friction_terms in terms.frictions
         ]
@@ -47,14 +49,15 @@ class FrictionJacobian:
     def reserve(self) -> None:
         """Allocate outputs for the capacity of the pair lists."""
         most = max(pairs.capacity for pairs in self.system.search.lists)
-        shape, vector, device = (ITEMS if self._rolls else PAIR_NODES, most), self.coupled.vector, self.coupled.device
+        items = ITEMS if self._rolls or self._rotates else PAIR_NODES
+        shape, vector, device = (items, most), self.coupled.vector, self.coupled.device
 
         def zeros(rows, some):
             return wp.zeros((rows, most if some else 1), dtype=self.coupled.real, device=device)
 
         self.spun, self.radii, self._numbers = (
             zeros(SPUN, self._spins),
-            zeros(ROLLED, self._rolls),
+            zeros(ROLLED, self._rolls or self._rotates),
             zeros(NUMBERS, True),
         )
         self._start_parts, self._lagged_parts = (device_arrays.allocate(shape, vector, device) for _ in range(2))
@@ -68,15 +71,17 @@ class FrictionJacobian:
 
         Args:
             index: number of the list.
-            ends: nodes and angles of the pairs.
+            ends: nodes, angles and rotations of the pairs.
             positions: blocks at the friction lag, at the start and at the solution (W N,) each.
             w: solution of the linear system (W N,).
             numbers: output, derivatives by the parameters of pairs.
         """
         terms = self.system.terms
         friction = terms.frictions[index]
-        inputs = [friction.pairs, friction.count, friction.found.sides, terms.lag_law, *ends, friction.factor.used]
+        inputs = [friction.pairs, friction.count, friction.found.sides, terms.lag_law, *ends]
         inputs += [
+            friction.lagged.radii,
+            friction.factor.used,
             *positions,
             w,
             self._velocity,
@@ -116,15 +121,21 @@ class FrictionJacobian:
         """
         friction = self.system.terms.frictions[index]
         count, device, size = int(friction.count.numpy()[0]), self.coupled.device, 3 * len(q)
-        blocks, angles, ends = friction.factor.nodes.numpy()[:count], friction.factor.angles, None
+        angles, rotations, ends = friction.factor.angles, friction.factor.rotations, None
+        blocks = np.full((count, ITEMS), -1)
+        blocks[:, :PAIR_NODES] = friction.factor.nodes.numpy()[:count]
         if friction.rolls:
-            blocks = np.column_stack([blocks, angles.numpy()[:count]])
+            blocks[:, PAIR_NODES:FIRST_BODY] = angles.numpy()[:count]
+        if friction.rotates:
+            blocks[:, FIRST_BODY:] = rotations.numpy()[:count]
         involved = (friction.factor.used.numpy()[:count, None] != 0) & (blocks >= 0)
         involved[:, friction.found.kind.first + friction.found.kind.second : PAIR_NODES] = False
         private = np.where(involved, len(q) + np.arange(blocks.size).reshape(blocks.shape), blocks).astype(np.int32)
         nodes = device_arrays.upload(private[:, :PAIR_NODES], wp.vec4i, device)
         if friction.rolls:
-            angles = device_arrays.upload(private[:, PAIR_NODES:], wp.vec2i, device)
+            angles = device_arrays.upload(private[:, PAIR_NODES:FIRST_BODY], wp.vec2i, device)
+        if friction.rotates:
+            rotations = device_arrays.upload(private[:, FIRST_BODY:], wp.vec2i, device)
         if friction.directions[0]:
             world, first = np.divmod(friction.pairs.numpy()[:count, 0], friction.found.first.count)
             ends = friction.directions[0].numpy()[first] + world[:, None] * self.coupled.blocks
@@ -139,17 +150,18 @@ class FrictionJacobian:
             columns = 3 * block[:, None] + np.arange(3)
             entries.append((np.repeat(row, 3), columns.ravel(), gradients.astype(float).ravel()))
 
-        for slot in range(blocks.shape[1]):
+        slots = np.flatnonzero(involved.any(0))
+        for slot in slots:
             on = np.flatnonzero(involved[:, slot])
-            for d in range(3 if slot < PAIR_NODES else 1):
+            for d in range(1 if PAIR_NODES <= slot < FIRST_BODY else 3):
                 unit = np.zeros((len(x), 3))
                 unit[private[on, slot], d] = 1.0
                 w.assign(unit)
-                written = self.vjp(index, (nodes, angles), (x, start, x), w, rate, self._numbers)
+                written = self.vjp(index, (nodes, angles, rotations), (x, start, x), w, rate, self._numbers)
                 by_x, _, by_lagged = (array.numpy()[:, :count] for array in written)
                 by_x[:PAIR_NODES] += by_lagged[:PAIR_NODES]
                 row = 3 * blocks[:, slot] + d
-                for column in range(blocks.shape[1]):
+                for column in slots:
                     both = on[involved[on, column]]
                     add(row[both], blocks[both, column], by_x[column, both])
                 if ends is not None:
