@@ -20,11 +20,14 @@ def scene(kind: str) -> ddg.Scene:
     made.clamp(made.add_rod(points, section=section), motion=ddg.Grip())
     if kind == "net":
         made.join([(0, 8), (made.add_rod(points + [1.0, 0.0, 0.0], section=section), 0)])
+    if kind == "body in contact":
+        made.add_body(ddg.Sphere((0.5, 0.0, 0.085), 0.05), density=100.0, angular_velocity=(0.0, 3.0, 0.0))
+        made.contact(range=0.02, radius={"rod": 0.02}, friction=0.3)
     return made
 
 
 @pytest.mark.parametrize("worlds", [1, 2])
-@pytest.mark.parametrize("kind", ["rods", "net"])
+@pytest.mark.parametrize("kind", ["rods", "net", "body in contact"])
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda obj: pickle.loads(pickle.dumps(obj))], ids=["copy", "pickle"])
 def test_copies_continue_bitwise(device, kind, worlds, copied):
     """Copied together: a model with changed parameters and a state after some steps; copied alone: the state."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -34,7 +33,7 @@ class Contact:
     friction_iterations: int | None = None
     rolling: bool = False
     exclusion_length: float | None = None
-    radius: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    radius: Mapping[str, float] = field(default_factory=dict)
     objects: tuple[str, ...] | None = None
 
     @property
@@ -147,7 +146,7 @@ class Contacts:
             else argument_checks.count(f"{call}friction_iterations", friction_iterations),
             argument_checks.flag(f"{call}rolling", rolling),
             exclusion_length,
-            MappingProxyType(dict(radius or {})),
+            dict(radius or {}),
             None if objects is None else _names(f"{call}objects", objects),
         )
 
