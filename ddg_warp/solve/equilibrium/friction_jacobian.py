@@ -6,7 +6,7 @@ from scipy import sparse
 
 from ddg_warp import device_arrays
 from ddg_warp.kernels.adjoint.contact import NUMBERS, ROLLED, SPUN, friction_jacobian_kernel
-from ddg_warp.kernels.collision.contact.assembly import FIRST_BODY, ITEMS, PAIR_NODES
+from ddg_warp.kernels.collision.contact.assembly import ITEMS, PAIR_NODES
 from ddg_warp.kernels.terms import FRICTION_LAWS
 from ddg_warp.solve.collision.rolling_rotation import rotated_by
 
@@ -115,27 +115,21 @@ class FrictionJacobian:
         )
 
     def _of_list(self, index: int, q: wp.array, before: wp.array, rate: wp.array) -> sparse.csc_matrix:
-        """Return the derivative by q of the friction on one list of pairs.
+        """Return the derivative by q of the friction on one list of pairs, without rigid bodies.
 
         Each pair has private blocks, behind the blocks of the coupled system; w is a unit vector there, one component at a time.
         """
         friction = self.system.terms.frictions[index]
         count, device, size = int(friction.count.numpy()[0]), self.coupled.device, 3 * len(q)
-        angles, rotations, ends = friction.factor.angles, friction.factor.rotations, None
-        blocks = np.full((count, ITEMS), -1)
-        blocks[:, :PAIR_NODES] = friction.factor.nodes.numpy()[:count]
+        blocks, angles, ends = friction.factor.nodes.numpy()[:count], friction.factor.angles, None
         if friction.rolls:
-            blocks[:, PAIR_NODES:FIRST_BODY] = angles.numpy()[:count]
-        if friction.rotates:
-            blocks[:, FIRST_BODY:] = rotations.numpy()[:count]
+            blocks = np.column_stack([blocks, angles.numpy()[:count]])
         involved = (friction.factor.used.numpy()[:count, None] != 0) & (blocks >= 0)
         involved[:, friction.found.kind.first + friction.found.kind.second : PAIR_NODES] = False
         private = np.where(involved, len(q) + np.arange(blocks.size).reshape(blocks.shape), blocks).astype(np.int32)
         nodes = device_arrays.upload(private[:, :PAIR_NODES], wp.vec4i, device)
         if friction.rolls:
-            angles = device_arrays.upload(private[:, PAIR_NODES:FIRST_BODY], wp.vec2i, device)
-        if friction.rotates:
-            rotations = device_arrays.upload(private[:, FIRST_BODY:], wp.vec2i, device)
+            angles = device_arrays.upload(private[:, PAIR_NODES:], wp.vec2i, device)
         if friction.directions[0]:
             world, first = np.divmod(friction.pairs.numpy()[:count, 0], friction.found.first.count)
             ends = friction.directions[0].numpy()[first] + world[:, None] * self.coupled.blocks
@@ -150,18 +144,19 @@ class FrictionJacobian:
             columns = 3 * block[:, None] + np.arange(3)
             entries.append((np.repeat(row, 3), columns.ravel(), gradients.astype(float).ravel()))
 
-        slots = np.flatnonzero(involved.any(0))
-        for slot in slots:
+        for slot in range(blocks.shape[1]):
             on = np.flatnonzero(involved[:, slot])
-            for d in range(1 if PAIR_NODES <= slot < FIRST_BODY else 3):
+            for d in range(3 if slot < PAIR_NODES else 1):
                 unit = np.zeros((len(x), 3))
                 unit[private[on, slot], d] = 1.0
                 w.assign(unit)
-                written = self.vjp(index, (nodes, angles, rotations), (x, start, x), w, rate, self._numbers)
+                written = self.vjp(
+                    index, (nodes, angles, friction.factor.rotations), (x, start, x), w, rate, self._numbers
+                )
                 by_x, _, by_lagged = (array.numpy()[:, :count] for array in written)
                 by_x[:PAIR_NODES] += by_lagged[:PAIR_NODES]
                 row = 3 * blocks[:, slot] + d
-                for column in slots:
+                for column in range(blocks.shape[1]):
                     both = on[involved[on, column]]
                     add(row[both], blocks[both, column], by_x[column, both])
                 if ends is not None:
