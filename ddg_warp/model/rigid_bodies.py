@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ddg_warp.errors import SceneError
 from ddg_warp.kernels.rigid_bodies import motion
 from ddg_warp.typing import Floats
 
@@ -127,11 +126,3 @@ def body_energies(state) -> tuple[np.ndarray, np.ndarray]:
     q = state.coupled.q.numpy().astype(float).reshape(model.worlds, -1, 3)
     weight = model.coupled.host.mass[host.origins] * np.array(model.scene.gravity, float)
     return kinetic, -((q[:, host.centers] - q[:, host.origins]) * weight).sum((1, 2))
-
-
-def refuse_rigid_bodies(call: str, model) -> None:
-    """Raise SceneError if a model has rigid bodies, for a call that does not support these."""
-    if model.scene.bodies:
-        raise SceneError(
-            f"{call}: body 0 ('{model.scene.bodies[0].name}') is rigid; rigid bodies are stepped in time alone, by an Integrator"
-        )
