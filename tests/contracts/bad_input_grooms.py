@@ -56,7 +56,8 @@ def layer(path="hair.usda", points=None, velocities=None):
 
 each("grooms", "samples", ["all", 0, -1, 1.5, None], lambda v: opened(samples=v), "open_groom: samples")
 each("grooms", "prim", ["hair", 3, "/no/prim"], lambda v: opened(prim=v), "prim")
-each("grooms", "young", [0.0, -1.0, NAN, "no_such", [1.0, 2.0]], lambda v: described(young=v), "young")
+each("grooms", "young", [0.0, -1.0, NAN, [1.0, 2.0]], lambda v: described(young=v), "young")
+each("grooms", "young by", ["no_such"], lambda v: described(young=v), "no primvar 'no_such'", "clump_id, st")
 each("grooms", "radius", [0.0, -1.0, NAN, INF], lambda v: described(radius=v), "radius")
 each("grooms", "range", [0.0, -1.0, NAN, "far"], lambda v: described(range=v), "groom: range", "positive")
 each("grooms", "root length", [0.0, -1.0, NAN], lambda v: described(root_length=v), "root_length", "positive")
