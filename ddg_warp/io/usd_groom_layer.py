@@ -134,12 +134,12 @@ class GroomLayer:
             curves.GetVelocitiesAttr().Set(vectors(all_velocities), code)
 
     def _rate_of_placement(self, curves: UsdGeom.BasisCurves, code: Usd.TimeCode, where: str) -> np.ndarray:
-        """Return the rate of the matrix to the world [1/s] (4, 4)."""
+        """Return the rate of the matrix to the world [1/s] (4, 4), backward as velocities of steps are, forward at the start."""
+        first = code.GetValue() - (RATE_STEP if code.GetValue() > self.groom.start else 0.0)
         before, after = (
-            placement(curves, Usd.TimeCode(code.GetValue() + sign * RATE_STEP), where, CurveError)[0]
-            for sign in (-1, 1)
+            placement(curves, Usd.TimeCode(each), where, CurveError)[0] for each in (first, first + RATE_STEP)
         )
-        return (after - before) * (0.5 * self.groom.rate / RATE_STEP)
+        return (after - before) * (self.groom.rate / RATE_STEP)
 
     def _checked(self, name: str, values) -> np.ndarray:
         values = np.asarray(values, np.float64)

@@ -274,7 +274,8 @@ def placement(
     unit, up = UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)
     if not 0.0 < unit < np.inf:
         raise error(f"{where}: metersPerUnit of the file is {unit}; set it to the length of its unit [m], such as 0.01")
-    matrix = np.array(shape.ComputeLocalToWorldTransform(time)) * unit
+    matrix = np.array(shape.ComputeLocalToWorldTransform(time))
+    matrix[:, :3] *= unit
     volume = abs(np.linalg.det(matrix[:3, :3])) if np.isfinite(matrix).all() else np.nan
     if not 0.0 < volume < np.inf:
         raise error(f"{where}: its transforms scale volumes by {volume}; correct those that scale, or metersPerUnit")

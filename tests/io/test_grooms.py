@@ -184,3 +184,48 @@ def test_stiffness_and_curl_by_primvars_and_groups(tmp_path):
     np.testing.assert_allclose(
         np.concatenate([np.ravel(b.section.EI1) for b in soft]), 5e8 * np.pi * 1e-16 / 4.0, rtol=1e-12
     )
+
+
+STAGE = """#usda 1.0
+(
+    metersPerUnit = {unit}
+    upAxis = "{up}"
+    startTimeCode = 1
+    endTimeCode = 4
+    timeCodesPerSecond = 24
+)
+def Xform "head"
+{{
+    double3 xformOp:translate.timeSamples = {{ 1: (0, 0, 0), 4: ({shift}, 0, 0) }}
+    double xformOp:rotateX.timeSamples = {{ 1: 0, 4: 20 }}
+    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateX"]
+    def BasisCurves "hair"
+    {{
+        uniform token type = "linear"
+        int[] curveVertexCounts = [5, 5]
+        point3f[] points = {points}
+        float[] widths = [{width}] (interpolation = "constant")
+    }}
+}}
+"""
+
+
+@pytest.mark.parametrize(("unit", "up"), [(1.0, "Z"), (0.01, "Y"), (0.001, "Z")])
+def test_roots_stay_in_moving_prims(tmp_path, unit, up):
+    """Without a skin the first edges rest in their prim, whose transform moves by 0.1 m; their velocities there are zero."""
+    along = np.arange(5)[:, None] * [0.0, 0.02 / unit, 0.01 / unit]
+    points = np.concatenate([along + [0.0, 0.3 / unit, 0.0], along + [0.1 / unit, 0.3 / unit, 0.0]])
+    (tmp_path / "shot.usda").write_text(
+        STAGE.format(unit=unit, up=up, shift=0.1 / unit, points=[tuple(p) for p in points.tolist()], width=1e-4 / unit)
+    )
+    ddg.simulate_groom(tmp_path / "shot.usda", "/head/hair", out=tmp_path / "hair.usda", progress=False)
+    stage = Usd.Stage.Open(str(tmp_path / "hair.usda"))
+    curves = UsdGeom.BasisCurves(stage.GetPrimAtPath("/head/hair"))
+    roots = [0, 1, 5, 6]
+    for code in (1, 2, 3, 4):
+        written = np.array(curves.GetPointsAttr().Get(code)) * unit
+        assert written[roots] == pytest.approx(points[roots] * unit, abs=3e-7)
+        velocities = np.array(curves.GetVelocitiesAttr().Get(code)) * unit
+        assert (np.abs(velocities[roots]).max() > 0.5) == (code == 1)  # the world is at rest there, and the prim is not
+        assert code == 1 or np.abs(velocities[roots]).max() < 0.02  # w^2 r h / 2 = 0.013 m/s of backward differences
+    assert np.abs(written - points * unit).max() > 1e-3

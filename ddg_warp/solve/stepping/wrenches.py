@@ -402,7 +402,7 @@ class CoupledReactions(_Reactions):
                 kernel = support_forces.element_force_kernel(storage, 0, storage.slots, rows, real)
                 self._sets.append((index, self._pairs(np.stack([0 * elements, elements], -1)), first, kernel))
             first += len(elements)
-        rows = max(len(element_set.slots) for element_set in host.sets)
+        rows = max((len(element_set.slots) for element_set in host.sets), default=1)
         self._values = wp.zeros((rows, total * model.worlds), dtype=self._vector, device=self._device)
         self._react, self.kernels = None, [kernel for *_, kernel in self._sets]
         self._normals = self._obstacles = None
