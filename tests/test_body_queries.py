@@ -57,3 +57,18 @@ def test_bodies_without_rods_are_recorded(tmp_path):
         assert reader.points.shape == (6, 0, 3)
         assert reader.obstacle_points[-1, 0] == pytest.approx(result.state.body(0).position)
     assert (tmp_path / "run" / "picture.png").exists()
+
+
+def test_obstacles_react_to_bodies_alone():
+    """A scene without elements has reactions: the floor carries the ball."""
+    scene = ddg.Scene()
+    scene.add_obstacle(ddg.Plane(), name="floor")
+    scene.add_body(ddg.Sphere((0.0, 0.0, 0.051), 0.05), mass=0.5)
+    scene.contact()
+    model = scene.build(device="cpu")
+    rest = ddg.statics.solve(model)
+    assert model.reactions(rest)["floor"].force == pytest.approx([0, 0, 0.5 * 9.81], rel=1e-5, abs=1e-9)
+    integrator = ddg.Integrator(model)
+    integrator.watch_wrenches()
+    integrator.step(rest, 0.01)
+    assert integrator.wrenches()["floor"].force == pytest.approx([0, 0, 0.5 * 9.81], rel=1e-3)

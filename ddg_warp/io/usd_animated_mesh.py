@@ -7,7 +7,7 @@ from pxr import Usd, UsdGeom
 
 from ddg_warp.io.faces import triangulated
 from ddg_warp.io.paths import MeshError, existing
-from ddg_warp.io.usd_read import opened, placement, shapes_below
+from ddg_warp.io.usd_read import mesh_below, opened, placement
 from ddg_warp.scene.animated_mesh import AnimatedMesh
 from ddg_warp.typing import FilePath
 
@@ -31,11 +31,7 @@ def read_animated_mesh(
     """
     path = existing(path)
     with opened(path, MeshError, outside) as stage:
-        meshes, _ = shapes_below(stage, path, prim, UsdGeom.Mesh, MeshError)
-        if len(meshes) != 1:
-            listed = ", ".join(str(mesh.GetPath()) for mesh in meshes[:5]) or "none"
-            raise MeshError(f"{path}: there are {len(meshes)} meshes to read ({listed}); give prim= the path of one")
-        (mesh,) = meshes
+        mesh, _ = mesh_below(stage, path, prim)
         where = f"{path}, {mesh.GetPath()}"
         codes = _codes(mesh)
         if start is None and stage.HasAuthoredTimeCodeRange():

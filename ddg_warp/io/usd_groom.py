@@ -92,6 +92,10 @@ class GroomPrim:
     instances: tuple[str, ...]
     sampled: cubic.Sampled
 
+    def __repr__(self) -> str:
+        kind = f"{self.type} {self.basis}".strip()
+        return f"<GroomPrim {self.path} of {len(self.counts)} curves, {kind}, primvars: {', '.join(self.primvars) or 'none'}>"
+
     @property
     def closed(self) -> bool:
         """True for periodic curves."""

@@ -83,14 +83,7 @@ def read_mesh_prim(path, prim: str | None = None, outside: bool = False) -> File
     """
     path = existing(path)
     with opened(path, MeshError, outside) as stage:
-        meshes, unread = shapes_below(stage, path, prim, UsdGeom.Mesh, MeshError)
-        if len(meshes) != 1:
-            contents = f"; it holds {_listed(unread)}" if unread and not meshes else ""
-            listed = ", ".join(str(mesh.GetPath()) for mesh in meshes[:LISTED]) or "none"
-            raise MeshError(
-                f"{path}: there are {len(meshes)} meshes to read ({listed}){contents}; give prim= the path of one"
-            )
-        (mesh,) = meshes
+        mesh, unread = mesh_below(stage, path, prim)
         where = f"{path}, {mesh.GetPath()}"
         points, time = _points(mesh, where, MeshError)
         counts = whole_numbers(mesh.GetFaceVertexCountsAttr(), time)
@@ -264,6 +257,23 @@ def whole_numbers(attribute: Usd.Attribute, time: Usd.TimeCode) -> np.ndarray:
     if values.dtype.kind not in "iu" or values.ndim != 1:
         raise ValueError(f"{attribute.GetPath()} is {attribute.GetTypeName()}, not int[]")
     return values.astype(int)
+
+
+def mesh_below(stage: Usd.Stage, path: Path, prim: str | None) -> tuple[UsdGeom.Mesh, list[str]]:
+    """Return the only mesh at or below a prim, and shapes that are no meshes.
+
+    Raises:
+        MeshError: There is none, or there are several; lists shapes.
+    """
+    meshes, unread = shapes_below(stage, path, prim, UsdGeom.Mesh, MeshError)
+    if len(meshes) != 1:
+        place = "there" if prim is None else f"at {prim}"
+        contents = f", but {_listed(unread)}" if unread and not meshes else ""
+        listed = f" ({', '.join(str(mesh.GetPath()) for mesh in meshes[:LISTED])})" if meshes else ""
+        raise MeshError(
+            f"{path}: {place} are {len(meshes)} meshes to read{listed}{contents}; give the path of one mesh"
+        )
+    return meshes[0], unread
 
 
 def placement(

@@ -133,6 +133,9 @@ def groom_scene(
     strands = np.lexsort((groom.counts, groom.closed, groups))
     radius = _along(groom, "radius", groom.radius if radius is None else radius, groups)
     young = _along(groom, "young", young, groups)
+    for label, values in (("radius", radius), ("young", young)):
+        for node in np.flatnonzero(~((values > 0.0) & np.isfinite(values)))[:1]:
+            raise SceneError(f"groom: {label} is {values[node]:g} at node {node}; give positive numbers")
     natural = {
         name: _along(groom, name, 0.0 if value is None else value, groups)
         for name, value in (("curl", curl), ("twist", twist))
@@ -253,7 +256,8 @@ def _along(groom: Groom, label: str, value: Value | Floats | None, groups: np.nd
         for name in np.unique(groups).tolist():
             if name not in named:
                 raise SceneError(
-                    f"groom: {label} has no value for group {name!r}; it has {', '.join(map(repr, named))}"
+                    f"groom: {label} has no value for group {name!r}; it has {', '.join(map(repr, named))}; "
+                    "group= names the primvar of the groups"
                 )
             result[owners == name] = _along(groom, label, named[name], groups)[owners == name]
         return result

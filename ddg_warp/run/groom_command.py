@@ -65,6 +65,8 @@ def run_groom(chosen: argparse.Namespace) -> int:
         )
     for line in result.groom.unread:
         print(f"not read: {line}")
+    if chosen.frames is None and result.state.time == 0.0:
+        print("the stage has one time code, so that nothing moved; --frames N simulates frames after it")
     print(f"{len(result.groom.counts)} strands, {result.state.time:g} s: {result.path}")
     return 0
 

@@ -172,8 +172,20 @@ class FlowGrid(Flow):
         """Return the index of a time among the times, with its fraction."""
         return 0.0 if self.times is None else float(np.interp(t, self.times, np.arange(len(self.times))))
 
+    def __repr__(self) -> str:
+        size = " x ".join(map(str, np.shape(self.velocities)[:-1]))
+        return f"<FlowGrid of {size} velocities from {self.lower} to {self.upper} m>"
+
     def save(self, path: str | Path) -> None:
-        """Write a file for `load`, HDF5 for names that end in .h5 or .hdf5, else NumPy's .npz."""
+        """Write a file for `load`: HDF5 (.h5, .hdf5), or NumPy's .npz.
+
+        Raises:
+            SceneError: another suffix.
+        """
+        if not str(path).endswith((".npz", ".h5", ".hdf5")):
+            raise SceneError(
+                f"FlowGrid.save: {path}: a grid of flow is a .npz, .h5 or .hdf5 file; give one of these suffixes"
+            )
         arrays = {name: getattr(self, name) for name in NAMES if getattr(self, name) is not None}
         if _is_hdf5(path):
             import h5py
@@ -188,8 +200,10 @@ class FlowGrid(Flow):
         """Read a grid from a file of arrays "velocities", "lower", "upper" and, unless steady, "times": .npz or HDF5.
 
         Raises:
-            SceneError: an array is missing, or another one is there; the message names it.
+            SceneError: there is no file, an array is missing, or another one is there; the message names it.
         """
+        if not Path(path).is_file():
+            raise SceneError(f"FlowGrid.load: {path}: there is no such file; check the path")
         if _is_hdf5(path):
             import h5py
 

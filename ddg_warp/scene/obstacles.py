@@ -121,7 +121,10 @@ SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2,
 
 
 def Box(center: Vector, half: Vector, rotation: Numbers | None = None, radius: float = 0.0) -> Mesh:
-    """Return a box about `center` [m] with half lengths `half` (3,) [m], a `rotation` (3, 3), rounded by `radius` [m]."""
+    """Return a box about `center` [m] with half lengths `half` (3,) [m], a `rotation` (3, 3), rounded by `radius` [m].
+
+    The rounding is added outside. As a rigid body the box has mass and inertia of the sharp box.
+    """
     center, half = (np.array(argument_checks.vector(f"Box: {n}", v)) for n, v in (("center", center), ("half", half)))
     if not (half > 0.0).all():
         raise SceneError(f"Box: half = {half}; half lengths are positive [m]")

@@ -212,7 +212,7 @@ def Xform "head"
 
 @pytest.mark.parametrize(("unit", "up"), [(1.0, "Z"), (0.01, "Y"), (0.001, "Z")])
 def test_roots_stay_in_moving_prims(tmp_path, unit, up):
-    """Without a skin the first edges rest in their prim, whose transform moves by 0.1 m; their velocities there are zero."""
+    """First edges without a skin rest in a moving prim: constant points, zero velocities."""
     along = np.arange(5)[:, None] * [0.0, 0.02 / unit, 0.01 / unit]
     points = np.concatenate([along + [0.0, 0.3 / unit, 0.0], along + [0.1 / unit, 0.3 / unit, 0.0]])
     (tmp_path / "shot.usda").write_text(

@@ -200,13 +200,13 @@ def test_usd_files_with_several_or_bad_meshes_are_refused(tmp_path):
     points, triangles = meshes.sphere(0)
     stage, mesh = stage_with_mesh(tmp_path / "a.usda", points, triangles)
     add_mesh(stage, "/Model/Box/Lid", points + 5.0, triangles)
-    with pytest.raises(MeshError, match=r"there are 2 meshes to read \(/Model/Ball, /Model/Box/Lid\); give prim="):
+    with pytest.raises(MeshError, match=r"there are 2 meshes to read \(/Model/Ball, /Model/Box/Lid\); give the path of one mesh"):
         saved(stage)
     assert saved(stage, "/Model/Box")[2] == "Lid"
     assert saved(stage, "/Model/Ball")[2] == "Ball"
     with pytest.raises(MeshError, match="no prim /Nowhere"):
         saved(stage, "/Nowhere")
-    with pytest.raises(MeshError, match=r"0 meshes to read \(none\)"):
+    with pytest.raises(MeshError, match=r"0 meshes to read"):
         saved(Usd.Stage.CreateNew(str(tmp_path / "empty.usda")))
     for counts, indices, message in (
         ([3, 2], [0, 1, 2, 3, 4], "/Model/Ball: face 1 has 2 corners"),
