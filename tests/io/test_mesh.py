@@ -200,7 +200,9 @@ def test_usd_files_with_several_or_bad_meshes_are_refused(tmp_path):
     points, triangles = meshes.sphere(0)
     stage, mesh = stage_with_mesh(tmp_path / "a.usda", points, triangles)
     add_mesh(stage, "/Model/Box/Lid", points + 5.0, triangles)
-    with pytest.raises(MeshError, match=r"there are 2 meshes to read \(/Model/Ball, /Model/Box/Lid\); give the path of one mesh"):
+    with pytest.raises(
+        MeshError, match=r"there are 2 meshes to read \(/Model/Ball, /Model/Box/Lid\); give the path of one mesh"
+    ):
         saved(stage)
     assert saved(stage, "/Model/Box")[2] == "Lid"
     assert saved(stage, "/Model/Ball")[2] == "Ball"
