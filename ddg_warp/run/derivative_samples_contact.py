@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from ddg_warp.kernels.adjoint.contact import FRICTION, NUMBERS, RATE, friction_jacobian_kernel, pull_kernel
-from ddg_warp.kernels.collision.contact.assembly import PAIR_NODES, ROW, WEIGHT, factor_struct
+from ddg_warp.kernels.collision.contact.assembly import BODIES, PAIR_NODES, ROW, WEIGHT, factor_struct
 from ddg_warp.kernels.collision.contact.closest_points import (
     distance_function,
     end_function,
@@ -324,10 +324,12 @@ class FrictionSample(ContactSample):
             self._put(values, vector) for values in (self.data["lagged"], self.data["start"], -self.scatter(seed))
         )
         rate, (no_pair, no_four, no_vector, no_table) = self._put(self.data["rate"], real), self._nothing(real)
-        inputs = [1, pairs, count, *law[:2], self._places(), no_pair, used, lagged, start, law[2], w, VELOCITY, rate]
+        no_radii = wp.zeros(0, dtype=wp.types.vector(BODIES, real), device=device)
+        inputs = [1, pairs, count, *law[:2], self._places(), no_pair, no_pair, no_radii]
+        inputs += [used, lagged, start, law[2], w, VELOCITY, rate]
         parts, numbers = [self._parts(real) for _ in range(3)], self._numbers(real)
         tables = [wp.zeros((0, 0), dtype=real, device=device) for _ in range(2)]
-        kernel = friction_jacobian_kernel(self.collision, self.law, self.friction, real, False, False, False)
+        kernel = friction_jacobian_kernel(self.collision, self.law, self.friction, real, False, False, False, False)
         inputs += [no_pair, no_table, no_four, no_vector]
         wp.launch(kernel, 1, inputs, [*parts, numbers, no_vector, *tables], device=device)
         slopes, numbers = (
