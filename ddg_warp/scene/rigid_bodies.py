@@ -203,8 +203,8 @@ class RigidBodies:
             axis: direction at rest (3,).
             angle: driven angle, one number or a function of time [rad]; `Controls.angles` replaces it step by step.
             torque: on `second` about the axis, and the opposite one on `first`: one number, or a function of time [N m].
-            spring: torsional stiffness [N m]. `angle`, zero by default, is then that of the relaxed spring, and may have a torque,
-                damping and stops beside it: a servo motor.
+            spring: torsional stiffness [N m]. `angle`, zero by default, is then that of the relaxed spring. A torque, damping and stops
+                may act, too: a servo motor.
             damping: torque against the angular rate [N m s].
             stops: least and largest angle [rad].
             stiffness: of the separation [N/m], see `ball`; angles have this times the square of the arm.

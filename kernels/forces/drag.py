@@ -212,6 +212,28 @@ def rod_kernel(kind: RodKind, real, square: bool):
 
 
 @cache
+def block_function(real, square: bool):
+    """Return the device function `block(mass, D, x, v, u, rate, node)`: inertia and drag of a dof block of the coupled system.
+
+    `x` and `v` are of the start, `u` is the velocity of the fluid, and `node` is False for angles. `square`: quadratic drag.
+    """
+    V, M, Inertia = wp.types.vector(3, real), wp.types.matrix((3, 3), real), block_inertia(real)
+
+    @wp.func
+    def block(mass: V, D: M, x: V, v: V, u: V, rate: real, node: bool):
+        result = Inertia()
+        result.mass = mass
+        result.stiffness = D * rate
+        result.reference = x + u / rate
+        if wp.static(square):
+            if node:
+                result.reference += (v - u) * (real(0.5) / rate)
+        return result
+
+    return block
+
+
+@cache
 def coupled_kernel(real, square: bool):
     """Build the kernel `resist` of the coupled system: write the inertia of every block with drag, at the start of a solve.
 
@@ -219,7 +241,7 @@ def coupled_kernel(real, square: bool):
     """
     V, M, P = wp.types.vector(3, real), wp.types.matrix((3, 3), real), wp.types.vector(ROWS, real)
     Inertia = block_inertia(real)
-    half = resistance_function(3, real, square)
+    half, block = resistance_function(3, real, square), block_function(real, square)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def resist(
@@ -270,16 +292,10 @@ def coupled_kernel(real, square: bool):
             else:
                 D[0, 0] = coefficients[wp.static(ROTATIONAL), edge + w * ends.shape[0]] * wp.length(e)
         rate = scalars[INVERSE_STEP, w]
-        block = Inertia()
-        block.mass = mass[w, k]
-        block.stiffness = D * rate
-        block.reference = q0[i] + u / rate
-        if wp.static(square):
-            if k < nodes:
-                block.reference += (v0[i] - u) * (real(0.5) / rate)
-        inertia_out[w, k] = block
+        written = block(mass[w, k], D, q0[i], v0[i], u, rate, k < nodes)
+        inertia_out[w, k] = written
         if k < nodes and load[w] == real(0.0):
             moved = wp.length(q[i] - q0[i]) + wp.length(u) / rate
-            wp.atomic_max(scalars, LOAD_SCALE, w, real(nodes) * moved * wp.max(wp.get_diag(block.stiffness)))
+            wp.atomic_max(scalars, LOAD_SCALE, w, real(nodes) * moved * wp.max(wp.get_diag(written.stiffness)))
 
     return resist

@@ -14,7 +14,7 @@ import warp as wp
 from ddg_warp.kernels.core.inertia import block_inertia
 from ddg_warp.kernels.core.islands import INVERSE_STEP, LOAD_SCALE, STEP_PROGRESS
 from ddg_warp.kernels.core.launch import CPU_OPTIONS
-from ddg_warp.kernels.forces.drag import square_function
+from ddg_warp.kernels.forces.drag import block_function, square_function
 
 NORMAL, TANGENTIAL = range(2)  # rows of coefficients of a triangle [N s/m^3], of quadratic drag [kg/m^3]
 
@@ -43,12 +43,8 @@ def corner_function(real, square: bool):
 @cache
 def resist_kernel(real, square: bool, alone: bool):
     """Build the kernel `resist`: add the drag of shells to the inertia of blocks, or write both if `alone`."""
-    V, M, Inertia, third = (
-        wp.types.vector(3, real),
-        wp.types.matrix((3, 3), real),
-        block_inertia(real),
-        corner_function(real, square),
-    )
+    V, M, Inertia = wp.types.vector(3, real), wp.types.matrix((3, 3), real), block_inertia(real)
+    third, block = corner_function(real, square), block_function(real, square)
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options=CPU_OPTIONS)
     def resist(
@@ -90,18 +86,11 @@ def resist_kernel(real, square: bool, alone: bool):
             row = t + w * corners.shape[0]
             D += third(area, v0[i] - u, coefficients[wp.static(NORMAL), row], coefficients[wp.static(TANGENTIAL), row])
         if wp.static(alone):
-            block = Inertia()
-            block.mass = mass[w, k]
-            block.stiffness = D * rate
-            block.reference = q0[i] + u / rate
-            if wp.static(square):
-                if k < nodes:
-                    block.reference += (v0[i] - u) * (real(0.5) / rate)
-            inertia_out[w, k] = block
+            inertia_out[w, k] = block(mass[w, k], D, q0[i], v0[i], u, rate, k < nodes)
         else:
-            block = inertia_out[w, k]
-            block.stiffness += D * rate
-            inertia_out[w, k] = block
+            written = inertia_out[w, k]
+            written.stiffness += D * rate
+            inertia_out[w, k] = written
         if k < nodes and load[w] == real(0.0):
             moved = wp.length(q[i] - q0[i]) + wp.length(u) / rate
             wp.atomic_max(scalars, LOAD_SCALE, w, real(nodes) * moved * wp.max(wp.get_diag(D)) * rate)

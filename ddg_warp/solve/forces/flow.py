@@ -10,9 +10,8 @@ from ddg_warp.kernels.adjoint import flow as adjoint_kernels
 from ddg_warp.kernels.forces import flow as kernels
 from ddg_warp.scene.flow import FlowGrid, Turbulence, depends_on_position, flow_at, is_on_host, terms_of
 
-_grids: WeakKeyDictionary = (
-    WeakKeyDictionary()
-)  # velocities of each `FlowGrid` by device and type, as they may be large
+# velocities of each `FlowGrid` by device and type, as they may be large
+_grids: WeakKeyDictionary = WeakKeyDictionary()
 
 
 class FlowVelocity:
