@@ -11,10 +11,13 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 
+from ddg_warp.errors import MissingPackageError
+from ddg_warp.io.axes import in_metres
 from ddg_warp.io.file_mesh import FileMesh, mesh_of_polygons
 from ddg_warp.io.paths import MeshError, shown
 
@@ -34,7 +37,7 @@ OFF = re.compile(r"(ST)?(C)?(N)?OFF")
 
 def read_stl(path: Path) -> FileMesh:
     """Return the mesh of an STL file, with three vertices for each triangle, in units and axes of the file."""
-    with _library(path, "trimesh"):
+    with _library(path):
         import trimesh
 
         with open(path, "rb") as file:
@@ -47,15 +50,13 @@ def read_glb(path: Path) -> FileMesh:
 
     Buffers in other files are not opened.
     """
-    with _library(path, "trimesh"):
+    with _library(path):
         import trimesh
 
-        with open(path, "rb") as file:
-            content = file.read()
+        content = path.read_bytes()
         size = int.from_bytes(content[12:16], "little")
         described = json.loads(content[GLB_HEADER : GLB_HEADER + size])
-        with open(path, "rb") as file:
-            scene = trimesh.load_scene(file, file_type="glb", process=False)
+        scene = trimesh.load_scene(BytesIO(content), file_type="glb", process=False)
         points, faces, texture, lost, count = [np.zeros((0, 3))], [np.zeros((0, 3), int)], [], Counter(), 0
         for node in scene.graph.nodes_geometry:
             transform, name = scene.graph[node]
@@ -75,9 +76,8 @@ def read_glb(path: Path) -> FileMesh:
     unread = [f"{len(described[key])} {key}" for key in GLB_UNREAD if described.get(key)]
     if uv is None and any(each is not None for each in texture):
         unread.append("texture coordinates, as some meshes have none")
-    y_up = np.concatenate(points)
     return mesh_of_polygons(
-        *_fans(y_up @ [[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.concatenate(faces)),
+        *_fans(in_metres(np.concatenate(points), None, "y"), np.concatenate(faces)),
         str(path),
         path.stem,
         uv=uv,
@@ -99,7 +99,7 @@ def read_by_meshio(path: Path) -> FileMesh:
             raise _damaged(path, f"{line.decode(errors='replace')} {int(number)} elements in {len(content)} bytes")
     if kind == "abaqus" and re.search(rb"^\s*\*include", content, re.IGNORECASE | re.MULTILINE):
         raise MeshError(f"{path}: the file includes other files (*INCLUDE), which are not read; join them to one file")
-    with _library(path, "meshio"):
+    with _library(path):
         import importlib
 
         loaded = importlib.import_module(f"meshio.{kind}").read(str(path))
@@ -181,12 +181,12 @@ def _fans(points, faces) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @contextmanager
-def _library(path: Path, name: str) -> Iterator[None]:
-    """Raise a MeshError if a library is missing, or cannot read the file."""
+def _library(path: Path) -> Iterator[None]:
+    """Raise a MissingPackageError if a library is missing, and a MeshError if it cannot read the file."""
     try:
         yield
     except ModuleNotFoundError as error:
-        raise MeshError(f"{path}: {path.suffix} files are read by {name}: `pip install ddg-warp[meshes]`") from error
+        raise MissingPackageError(f"{path}: {path.suffix} files need", error, "meshes") from error
     except MeshError:
         raise
     except OSError as error:

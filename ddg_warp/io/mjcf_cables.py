@@ -15,6 +15,7 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
+from ddg_warp.errors import MissingPackageError
 from ddg_warp.io.curves import CurveSet, checked_curves
 from ddg_warp.io.paths import CurveError, shown
 
@@ -177,7 +178,7 @@ def _located(copy: Element, path: Path) -> dict[str, np.ndarray]:
     try:
         import mujoco
     except ModuleNotFoundError as error:
-        raise CurveError(f"{path}: MJCF files are read by mujoco: `pip install ddg-warp[mujoco]`") from error
+        raise MissingPackageError(f"{path}: MJCF files need", error, "mujoco") from error
     try:
         model = mujoco.MjModel.from_xml_string(ElementTree.tostring(copy, encoding="unicode"))
     except ValueError as error:

@@ -7,7 +7,8 @@ from pxr import Usd, UsdGeom
 
 from ddg_warp.io.faces import triangulated
 from ddg_warp.io.paths import MeshError, existing
-from ddg_warp.io.usd_read import mesh_below, opened, placement
+from ddg_warp.io.usd_read import is_reversed, mesh_below, opened, placement
+from ddg_warp.io.usd_texture import subdivision
 from ddg_warp.scene.animated_mesh import AnimatedMesh
 from ddg_warp.typing import FilePath
 
@@ -53,8 +54,7 @@ def read_animated_mesh(
                 raise MeshError(f"{where}: a point at time code {code:g} is not finite; correct it")
         triangles, face = triangulated(frames[0], counts, indices, where)
         triangles = triangles[~np.isin(face, holes)]
-        mirrored = np.linalg.det(to_world[:3, :3]) < 0.0
-        if (mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded) != mirrored:
+        if is_reversed(mesh, to_world):
             triangles = triangles[:, [0, 2, 1]]
         used, triangles = np.unique(triangles, return_inverse=True)
         unread = _unread(mesh, len(frames[0]) - len(used))
@@ -93,11 +93,6 @@ def _unread(mesh: UsdGeom.Mesh, unused: int) -> list[str]:
     result = [f"{path}: {unused} vertices are of no face and left out"] if unused else []
     if mesh.GetPrim().GetRelationship("skel:skeleton").GetTargets():
         result.append(f"{path}: its skeleton is not evaluated; bake the deformation into points")
-    if (
-        mesh.GetSubdivisionSchemeAttr().Get() != UsdGeom.Tokens.none
-        and mesh.GetSubdivisionSchemeAttr().HasAuthoredValue()
-    ):
-        result.append(
-            f"{path}: its subdivision ({mesh.GetSubdivisionSchemeAttr().Get()}) is not evaluated, the control mesh is read"
-        )
+    if scheme := subdivision(mesh):
+        result.append(f"{path}: its subdivision ({scheme}) is not evaluated, the control mesh is read")
     return result

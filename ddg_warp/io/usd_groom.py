@@ -20,7 +20,7 @@ from ddg_warp.io import cubic
 from ddg_warp.io.curves import CurveSet, checked_curves
 from ddg_warp.io.paths import CurveError, existing
 from ddg_warp.io.usd_read import FINER, opened, placement, shapes_below, splines
-from ddg_warp.scene.frame_motion import FrameMotion
+from ddg_warp.scene.frame_motion import FrameMotion, nearest_rotations
 from ddg_warp.typing import Array, Bools, FilePath, Floats, Integers, Names
 
 FLOOR = 0.1  # least radius of a node over the largest of its strand
@@ -28,21 +28,9 @@ SAMPLINGS = ("interpolating", "vertices")
 IDS = ("groom_id", "hair_id", "id", "ids")
 GROUPS = ("groom_group_id", "groom_group_name", "group", "group_id")
 GUIDES = ("groom_guide", "guide")
-GEOMETRY = {
-    *(
-        "points",
-        "curveVertexCounts",
-        "widths",
-        "extent",
-        "type",
-        "basis",
-        "wrap",
-        "orientation",
-        "doubleSided",
-        "purpose",
-    ),
-    *("visibility", "xformOpOrder"),
-}  # attributes that are read, or that the layer writes
+# attributes that are read, or that the layer writes
+GEOMETRY = {"points", "curveVertexCounts", "widths", "extent", "type", "basis", "wrap", "orientation", "doubleSided"}
+GEOMETRY |= {"purpose", "visibility", "xformOpOrder"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,9 +322,8 @@ class _Reader:
 
     def __init__(self, path: Path, code: float, samples: str | int, unread: list[str]):
         self._path, self._code, self._samples, self._unread = path, Usd.TimeCode(code), samples, unread
-        self._fine = FINER * (
-            cubic.BEZIER_STEP if isinstance(samples, str) else samples
-        )  # points of a segment, for errors
+        # points of a segment, for errors
+        self._fine = FINER * (cubic.BEZIER_STEP if isinstance(samples, str) else samples)
 
     def read(self, curves: UsdGeom.BasisCurves) -> tuple:
         """Return (prim, nodes [m], radius or None, error [m])."""
@@ -552,9 +539,7 @@ def prim_motion(groom: Groom, roots: np.ndarray, strands: np.ndarray) -> FrameMo
 
     def frames(t: float) -> tuple[np.ndarray, np.ndarray]:
         moved = (back @ matrices(t))[owner]
-        u, _, v = np.linalg.svd(moved[:, :3, :3].swapaxes(1, 2))
-        rotation = u @ v
-        rotation *= np.sign(np.linalg.det(rotation))[:, None, None]
+        rotation = nearest_rotations(moved[:, :3, :3].swapaxes(1, 2))
         return np.einsum("ni,nij->nj", roots, moved[:, :3, :3]) + moved[:, 3, :3] - roots, rotation
 
     return FrameMotion(roots, frames)

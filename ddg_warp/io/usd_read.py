@@ -94,8 +94,7 @@ def read_mesh_prim(path, prim: str | None = None, outside: bool = False) -> File
         triangles, corners = triangles[solid], corners_of(triangles, face, counts, indices)[solid]
         texture, unread = corner_texture(mesh, time, indices)
         to_world, _ = placement(mesh, time, where, MeshError)
-        left_handed = mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
-        if left_handed != (np.linalg.det(to_world[:3, :3]) < 0.0):
+        if is_reversed(mesh, to_world):
             triangles, corners = triangles[:, [0, 2, 1]], corners[:, [0, 2, 1]]
         points = points @ to_world[:3, :3] + to_world[3, :3]
         uv, name = None if texture is None else texture[corners], mesh.GetPrim().GetName()
@@ -274,6 +273,12 @@ def mesh_below(stage: Usd.Stage, path: Path, prim: str | None) -> tuple[UsdGeom.
             f"{path}: {place} are {len(meshes)} meshes to read{listed}{contents}; give the path of one mesh"
         )
     return meshes[0], unread
+
+
+def is_reversed(mesh: UsdGeom.Mesh, to_world: np.ndarray) -> bool:
+    """Return True if faces have to be reversed, by their orientation and a mirroring transform (4, 4)."""
+    left_handed = mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+    return left_handed != (np.linalg.det(to_world[:3, :3]) < 0.0)
 
 
 def placement(

@@ -33,15 +33,20 @@ def write_texture(mesh: UsdGeom.Mesh, uv: np.ndarray) -> None:
     primvar.SetIndices(Vt.IntArray.FromNumpy(numbers.reshape(-1).astype(np.int32)))
 
 
+def subdivision(mesh: UsdGeom.Mesh) -> str:
+    """Return the subdivision scheme of a Mesh, "" without."""
+    scheme = mesh.GetSubdivisionSchemeAttr()
+    return str(scheme.Get()) if scheme.HasAuthoredValue() and scheme.Get() != UsdGeom.Tokens.none else ""
+
+
 def unread_of_mesh(mesh: UsdGeom.Mesh, holes: np.ndarray) -> list[str]:
     """Return a text for each content of a Mesh that is not read."""
     unread = [f"{len(holes)} holes (holeIndices)"] * bool(len(holes))
     samples = mesh.GetPointsAttr().GetNumTimeSamples()
     if samples > 1:
         unread.append(f"{samples - 1} further time samples of the points")
-    scheme = mesh.GetSubdivisionSchemeAttr()
-    if scheme.HasAuthoredValue() and scheme.Get() != UsdGeom.Tokens.none:
-        unread.append(f"subdivision ({scheme.Get()}): the mesh is that of its control points")
+    if scheme := subdivision(mesh):
+        unread.append(f"subdivision ({scheme}): the mesh is that of its control points")
     for primvar in UsdGeom.PrimvarsAPI(mesh).GetPrimvarsWithAuthoredValues():
         if primvar.GetPrimvarName() != NAME:
             unread.append(f"primvars:{primvar.GetPrimvarName()}")

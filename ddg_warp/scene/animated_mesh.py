@@ -7,7 +7,7 @@ import numpy as np
 
 from ddg_warp import argument_checks
 from ddg_warp.errors import SceneError
-from ddg_warp.scene.frame_motion import FrameMotion
+from ddg_warp.scene.frame_motion import FrameMotion, nearest_rotations
 from ddg_warp.scene.obstacles import Mesh
 from ddg_warp.scene.prescribed_motion import Motion
 from ddg_warp.typing import Floats, Integers, Numbers
@@ -112,8 +112,7 @@ class SurfaceFrames:
     def __call__(self, t: float) -> tuple[Floats, Floats]:
         """Return translations (n, 3) [m] and rotations (n, 3, 3) from rest."""
         corners = self._mesh.at(t)[self._corners]
-        u, _, v = np.linalg.svd(_frames(corners) @ self._inverse)  # of positive determinant
-        rotation = u @ v
+        rotation = nearest_rotations(_frames(corners) @ self._inverse)
         base = np.einsum("nc,ncd->nd", self.weights, corners)
         return base + np.einsum("nij,nj->ni", rotation, self._offset) - self._roots, rotation
 

@@ -99,6 +99,13 @@ class FrameMotion:
         return shift, rotation
 
 
+def nearest_rotations(matrices: Floats) -> Floats:
+    """Return the rotations nearest to matrices (n, 3, 3): their polar factors, with the sign that makes them rotations."""
+    u, _, v = np.linalg.svd(matrices)
+    rotations = u @ v
+    return rotations * np.sign(np.linalg.det(rotations))[:, None, None]
+
+
 def _rotation_vectors(rotations: Floats) -> Floats:
     """Return the rotation vectors (n, 3) of matrices (n, 3, 3)."""
     from scipy.spatial.transform import Rotation
