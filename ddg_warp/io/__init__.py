@@ -36,6 +36,7 @@ def read(
 
     Raises:
         CurveError: The file holds no usable curves.
+        MissingPackageError: An MJCF file needs the extra `mujoco`.
         TrajectoryError: An HDF5 file is damaged, or refers to another file without permission.
     """
     outside = argument_checks.flag("read: outside", outside)

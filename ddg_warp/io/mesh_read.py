@@ -61,6 +61,7 @@ def read_mesh(
 
     Raises:
         MeshError: the file cannot be read; names the file, the line or prim, and the remedy.
+        MissingPackageError: the format needs the extra `meshes`.
         SceneError: `weld` or `unit` is no positive length.
     """
     path, outside = existing(path), argument_checks.flag("read_mesh: outside", outside)
